@@ -36,7 +36,9 @@ class Display:
         for name in ("width", "height"):
             value = getattr(self, name)
             if not isinstance(value, int) or not 1 <= value <= 16384:
-                raise InputError(f"display {name} must be an integer from 1 to 16384 px, not {value}")
+                raise InputError(
+                    f"display {name} must be an integer from 1 to 16384 px, not {value}"
+                )
         for name in ("fx", "fy"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):

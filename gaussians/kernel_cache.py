@@ -25,7 +25,11 @@ def configure() -> Path:
         digest.update((root / name).read_bytes())
     cache_home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     parent = Path(os.environ.get("NUMBA_CACHE_DIR") or cache_home / "nebula" / "kernels")
-    folder = parent if parent.name.startswith("shared-") else parent / f"shared-{digest.hexdigest()[:12]}"
+    folder = (
+        parent
+        if parent.name.startswith("shared-")
+        else parent / f"shared-{digest.hexdigest()[:12]}"
+    )
     os.environ["NUMBA_CACHE_DIR"] = str(folder)
     if "numba" in sys.modules:
         sys.modules["numba"].config.CACHE_DIR = str(folder)

@@ -56,7 +56,9 @@ class Scene:
         if self.sh.ndim != 3 or self.sh.shape[0] != count or self.sh.shape[2] != 3:
             raise InputError(f"{name}: sh must have shape ({count}, K, 3), not {self.sh.shape}")
         if self.sh.shape[1] not in SH_DEGREE_OF_COUNT:
-            raise InputError(f"{name}: sh must hold 1, 4, 9 or 16 coefficients, not {self.sh.shape[1]}")
+            raise InputError(
+                f"{name}: sh must hold 1, 4, 9 or 16 coefficients, not {self.sh.shape[1]}"
+            )
         for field in (*shapes, "sh"):
             array = getattr(self, field)
             if array.dtype != np.float32:
@@ -106,9 +108,7 @@ def concatenate(scenes: list[Scene]) -> Scene:
     if not scenes:
         raise InputError("concatenate needs at least one scene")
     coefficients = max(s.sh.shape[1] for s in scenes)
-    harmonics = [
-        np.pad(s.sh, ((0, 0), (0, coefficients - s.sh.shape[1]), (0, 0))) for s in scenes
-    ]
+    harmonics = [np.pad(s.sh, ((0, 0), (0, coefficients - s.sh.shape[1]), (0, 0))) for s in scenes]
     plain = [np.concatenate([getattr(s, field) for s in scenes]) for field in FIELDS[:-1]]
     return Scene(*plain, np.concatenate(harmonics))
 

@@ -22,7 +22,7 @@ class EyeWork:
     alpha_checks: Int32  # live pixels tested, summed over processed entries
     passes: Int32  # live pixels that passed the test
     blends: Int32  # passes that were blended (a pass that stops its pixel is not)
-    terminated: Int32  # 1 where every pixel of the tile stopped before the end of the list
+    terminated: Int32  # 1 where every pixel of the tile stopped
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,9 @@ class StereoWork:
     """
 
     fifo_entries: Int32  # [rows, tiles_y, tiles_x] writes into row k destined for right tile x
-    forward_only: Int32  # [tiles_y, plane_tiles_x] entries added to a left tile for forwarding alone
+    forward_only: (
+        Int32  # [tiles_y, plane_tiles_x] entries added to a left tile for forwarding alone
+    )
     walked_after_termination: Int32  # [tiles_y, plane_tiles_x] entries read only for the SRU
     dropped: int  # forwards lost because the disparity exceeds the rows (method `paper`)
     duplicates: int  # equal heads the merge unit dropped
@@ -70,4 +72,6 @@ class FrameWork:
     left: EyeWork
     right: EyeWork
     stereo: StereoWork
-    independent_right_tiles: int  # right tiles binned and sorted on their own (method `paper`: edges)
+    independent_right_tiles: (
+        int  # right tiles binned and sorted on their own (method `paper`: edges)
+    )
