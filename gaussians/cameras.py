@@ -20,8 +20,8 @@ WINDOW_STEP_PX = 16  # window offsets are rounded to this, so that tiles of both
 class Display:
     """Pixels and focal lengths of one eye; both eyes look through one image plane.
 
-    ``cx_left`` and ``cx_right`` are the principal points in the two windows; they differ by a multiple
-    of 16 px on off-axis headsets and are equal otherwise.
+    ``cx_left`` and ``cx_right`` are the principal points in the two windows; they differ by a
+    multiple of 16 px on off-axis headsets and are equal otherwise.
     """
 
     width: int
@@ -56,7 +56,7 @@ class Display:
 
     @classmethod
     def from_fov(cls, width: int, height: int, fov_deg: float) -> Display:
-        """On-axis display with square pixels and this horizontal field of view per eye (degrees)."""
+        """On-axis display with square pixels and this horizontal field of view in degrees."""
         if not 1 <= fov_deg <= 170:
             raise InputError(f"field of view must lie in 1..170 degrees, not {fov_deg}")
         focal = 0.5 * width / math.tan(math.radians(fov_deg) / 2)
@@ -68,8 +68,8 @@ class Display:
     ) -> tuple[Display, float]:
         """Off-axis display from positive half-angles in radians; also the rounding in degrees.
 
-        ``outer`` is the temporal and ``inner`` the nasal half-angle of both (mirrored) eyes. The window
-        offset is rounded to 16 px; the second value is the angle by which that turns the window.
+        ``outer`` is the temporal and ``inner`` the nasal half-angle of both (mirrored) eyes. The
+        window offset is rounded to 16 px; the second value is the angle by which that turns it.
         """
         for name, angle in (("outer", outer), ("inner", inner), ("up", up), ("down", down)):
             if not 0.01 <= angle <= 1.5:
@@ -119,8 +119,8 @@ def look_at(eye: Float64, target: Float64, up: Float64) -> Pose:
 class StereoRig:
     """Two parallel cameras of one display, ``baseline_m`` apart along the camera x axis.
 
-    The left eye is at ``pose.position - baseline/2 * right``. Both eyes share y and z; the right eye's
-    camera coordinate is fl(x_left - baseline).
+    The left eye is at ``pose.position - baseline/2 * right``. Both eyes share y and z; the right
+    eye's camera coordinate is fl(x_left - baseline).
     """
 
     display: Display
@@ -153,7 +153,7 @@ class StereoRig:
 
     @property
     def jacobian_limits(self) -> tuple[float, float]:
-        """|x/z| and |y/z| inside the Jacobian are clamped to these (1.3 tan of the half field of view).
+        """|x/z| and |y/z| in the Jacobian are clamped to these, 1.3 tan(half field of view).
 
         One pair for both eyes: the wider side of the wider window.
         """

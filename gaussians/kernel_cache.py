@@ -1,8 +1,8 @@
 """Where compiled kernels are kept between runs.
 
-numba's disk cache notices a change of the file a kernel stands in, but not of a function that kernel
-imports from another file. Kernels therefore call only functions of their own file or of the files in
-``SHARED_SOURCES``, and the cache folder is named after a hash of exactly those files.
+numba's disk cache notices a change of the file a kernel stands in, but not of a function that
+kernel imports from another file. Kernels therefore call only functions of their own file or of the
+files in ``SHARED_SOURCES``, and the cache folder is named after a hash of exactly those files.
 """
 
 import hashlib

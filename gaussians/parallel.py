@@ -1,8 +1,8 @@
 """Runs a kernel over chunks of an index range on a few threads.
 
-Kernels release the GIL and write only to outputs of their own indices, so results cannot depend on the
-number of threads or on which thread takes which chunk. Compared with numba's ``prange`` this balances
-uneven rows, compiles several times faster, and leaves the process free to fork.
+Kernels release the GIL and write only to outputs of their own indices, so results cannot depend on
+the number of threads or on which thread takes which chunk. Compared with numba's ``prange`` this
+balances uneven rows, compiles several times faster, and leaves the process free to fork.
 """
 
 from __future__ import annotations
@@ -22,11 +22,8 @@ _state: dict[str, Any] = {"threads": None, "pool": None}
 def threads() -> int:
     """Number of threads kernels run on: `set_threads`, else the cores this process may use."""
     if _state["threads"] is None:
-        set_threads(
-            len(os.sched_getaffinity(0))
-            if hasattr(os, "sched_getaffinity")
-            else os.cpu_count() or 1
-        )
+        affinity = getattr(os, "sched_getaffinity", None)  # not on every platform
+        set_threads(len(affinity(0)) if affinity else os.cpu_count() or 1)
     return int(_state["threads"])
 
 
@@ -41,7 +38,7 @@ def set_threads(count: int) -> None:
 
 
 def run_chunks(kernel: Callable[..., Any], count: int, *arguments: Any) -> list[Any]:
-    """Call ``kernel(begin, end, *arguments)`` over 0..count in chunks; return values in chunk order.
+    """Call ``kernel(begin, end, *arguments)`` over 0..count in chunks; values in chunk order.
 
     The first chunk runs alone, so that a kernel is compiled once before threads call it.
     """

@@ -44,8 +44,8 @@ class ProjectedSplats:
         return len(self.features)
 
 
-class _Camera(NamedTuple):
-    """What the kernel needs of the rig, in float32."""
+class _Job(NamedTuple):
+    """What the kernel reads of rig and scene, and what it writes."""
 
     world_to_left: Float32  # [3, 4]
     baseline: np.float32
@@ -56,10 +56,18 @@ class _Camera(NamedTuple):
     cy: np.float32
     limit_x: np.float32
     limit_y: np.float32
+    ids: NDArray[np.int32]  # [M]
+    means: Float32
+    quaternions: Float32
+    scales: Float32
+    opacities: Float32
+    features: Float32  # [eyes, M, 10], written
+    covariances: Float32  # [eyes, M, 3], written
+    keep: NDArray[np.bool_]  # [M], written
 
 
 @njit(cache=True, error_model="numpy")
-def _threshold(opacity):  # type: ignore[no-untyped-def]
+def _threshold(opacity: np.float32) -> np.float32:
     """-ln(255 o) in float64, rounded up to float32."""
     exact = -ln_float64(255.0 * np.float64(opacity))
     rounded = np.float32(exact)
@@ -69,7 +77,7 @@ def _threshold(opacity):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _to_camera(world_to_left, quaternion, scale, t):  # type: ignore[no-untyped-def]
+def _to_camera(world_to_left: Float32, quaternion: Float32, scale: Float32, t: Float32) -> None:
     """t [3, 3] = camera rotation x splat rotation x scales, in the written order."""
     w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     m00 = (_ONE - _TWO * (y * y + z * z)) * scale[0]
@@ -89,34 +97,32 @@ def _to_camera(world_to_left, quaternion, scale, t):  # type: ignore[no-untyped-
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _project(
-    begin, end, camera, ids, means, quaternions, scales, opacities, features, covariances, keep
-):  # type: ignore[no-untyped-def]
-    r = camera.world_to_left
+def _project(begin: int, end: int, job: _Job) -> None:
+    r = job.world_to_left
     t = np.empty((3, 3), np.float32)
     for rank in range(begin, end):
-        i = ids[rank]
-        mx, my, mz = means[i, 0], means[i, 1], means[i, 2]
+        i = job.ids[rank]
+        mx, my, mz = job.means[i, 0], job.means[i, 1], job.means[i, 2]
         x_left = ((r[0, 0] * mx + r[0, 1] * my) + r[0, 2] * mz) + r[0, 3]
         y = ((r[1, 0] * mx + r[1, 1] * my) + r[1, 2] * mz) + r[1, 3]
         z = ((r[2, 0] * mx + r[2, 1] * my) + r[2, 2] * mz) + r[2, 3]
-        _to_camera(r, quaternions[i], scales[i], t)
-        kx = camera.fx / z
-        ky = camera.fy / z
+        _to_camera(r, job.quaternions[i], job.scales[i], t)
+        kx = job.fx / z
+        ky = job.fy / z
         ty = y / z
-        clamped_y = min(max(ty, -camera.limit_y), camera.limit_y)
+        clamped_y = min(max(ty, -job.limit_y), job.limit_y)
         b0 = t[1, 0] - clamped_y * t[2, 0]
         b1 = t[1, 1] - clamped_y * t[2, 1]
         b2 = t[1, 2] - clamped_y * t[2, 2]
         cyy = (ky * ky) * ((b0 * b0 + b1 * b1) + b2 * b2) + DILATION_PX2
-        v = camera.fy * ty + camera.cy
-        threshold = _threshold(opacities[i])
+        v = job.fy * ty + job.cy
+        threshold = _threshold(job.opacities[i])
         good = True
-        for eye in range(features.shape[0]):
-            x_eye = x_left - camera.baseline if eye == 1 else x_left
-            cx = camera.cx_right if eye == 1 else camera.cx_left
+        for eye in range(job.features.shape[0]):
+            x_eye = x_left - job.baseline if eye == 1 else x_left
+            cx = job.cx_right if eye == 1 else job.cx_left
             tx = x_eye / z
-            clamped_x = min(max(tx, -camera.limit_x), camera.limit_x)
+            clamped_x = min(max(tx, -job.limit_x), job.limit_x)
             a0 = t[0, 0] - clamped_x * t[2, 0]
             a1 = t[0, 1] - clamped_x * t[2, 1]
             a2 = t[0, 2] - clamped_x * t[2, 2]
@@ -127,24 +133,18 @@ def _project(
             if not (det > 0.0 and det < np.inf):
                 good = False
                 continue
-            covariances[eye, rank, 0] = cxx
-            covariances[eye, rank, 1] = cxy
-            covariances[eye, rank, 2] = cyy
-            record = features[eye, rank]
-            record[U] = camera.fx * tx + cx
+            job.covariances[eye, rank, 0] = cxx
+            job.covariances[eye, rank, 1] = cxy
+            job.covariances[eye, rank, 2] = cyy
+            record = job.features[eye, rank]
+            record[U] = job.fx * tx + cx
             record[V] = v
             record[CONIC_A] = np.float32(wide_yy / det)
             record[CONIC_B] = np.float32(-wide_xy / det)
             record[CONIC_C] = np.float32(wide_xx / det)
             record[THRESHOLD] = threshold
-            record[OPACITY] = opacities[i]
-        keep[rank] = good
-
-
-def _camera(rig: StereoRig) -> _Camera:
-    d = rig.display
-    numbers = (rig.baseline_m, d.fx, d.fy, d.cx_left, d.cx_right, d.cy, *rig.jacobian_limits)
-    return _Camera(rig.world_to_left, *(np.float32(n) for n in numbers))
+            record[OPACITY] = job.opacities[i]
+        job.keep[rank] = good
 
 
 def camera_depths(scene: Scene, rig: StereoRig) -> Float32:
@@ -169,8 +169,27 @@ def project(scene: Scene, rig: StereoRig, *, eyes: int = 2) -> ProjectedSplats:
     features = np.zeros((eyes, count, FEATURES), np.float32)
     covariances = np.zeros((eyes, count, 3), np.float32)
     keep = np.zeros(count, np.bool_)
-    arrays = (scene.means, scene.quaternions, scene.scales, scene.opacities)
-    run_chunks(_project, count, _camera(rig), ids, *arrays, features, covariances, keep)
+    limit_x, limit_y = rig.jacobian_limits
+    job = _Job(
+        world_to_left=rig.world_to_left,
+        baseline=np.float32(rig.baseline_m),
+        fx=np.float32(rig.display.fx),
+        fy=np.float32(rig.display.fy),
+        cx_left=np.float32(rig.display.cx_left),
+        cx_right=np.float32(rig.display.cx_right),
+        cy=np.float32(rig.display.cy),
+        limit_x=np.float32(limit_x),
+        limit_y=np.float32(limit_y),
+        ids=ids,
+        means=scene.means,
+        quaternions=scene.quaternions,
+        scales=scene.scales,
+        opacities=scene.opacities,
+        features=features,
+        covariances=covariances,
+        keep=keep,
+    )
+    run_chunks(_project, count, job)
     if not keep.all():
         ids = ids[keep]
         features = np.ascontiguousarray(features[:, keep])

@@ -1,8 +1,9 @@
-"""Rasterisation of one eye from its tile lists: alpha check, blending, early termination, and counts."""
+"""Rasterisation of one eye from its tile lists: alpha check, blending, termination, counts."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -45,22 +46,29 @@ class EyeImage:
     ]  # [pairs] 1 where the entry passed in a live pixel; [0] if not asked
 
 
+class _Job(NamedTuple):
+    """What the kernel reads, and after the lists what it writes."""
+
+    tile: int
+    first_column: int
+    last_column: int  # exclusive
+    tiles_x: int
+    features: Float32  # [M, 10]
+    offsets: NDArray[np.int64]
+    splats: NDArray[np.int32]
+    background: Float32  # [3]
+    image: Float32
+    transmittance: Float32
+    work: NDArray[np.int32]  # [_COUNTERS, tiles_y, tiles_x]
+    live_passes: NDArray[np.uint8]
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
-def _raster_rows(
-    begin,
-    end,
-    tile,
-    columns,
-    tiles_x,
-    features,
-    offsets,
-    splats,
-    background,
-    image,
-    transmittance,
-    work,
-    live_passes,
-):  # type: ignore[no-untyped-def]
+def _raster_rows(begin: int, end: int, job: _Job) -> None:
+    tile, tiles_x = job.tile, job.tiles_x
+    features, offsets, splats = job.features, job.offsets, job.splats
+    background, image, transmittance = job.background, job.image, job.transmittance
+    work, live_passes = job.work, job.live_passes
     height, width = transmittance.shape
     pixels = tile * tile
     xs, ys = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
@@ -74,7 +82,7 @@ def _raster_rows(
     live, passed = np.empty(pixels, np.int32), np.empty(pixels, np.int32)
     record_passes = live_passes.shape[0] > 0
     for row in range(begin, end):
-        for column in range(columns[0], columns[1]):
+        for column in range(job.first_column, job.last_column):
             live_count = 0
             for lane in range(pixels):
                 x, y = column * tile + lane % tile, row * tile + lane // tile
@@ -157,7 +165,7 @@ def rasterise(
     lists : tile lists of the same grid
     background : colour behind everything
     columns : half-open range of tile columns to render; all by default
-    onto : write into (a copy of nothing: the same arrays as) this earlier image, for the other columns
+    onto : earlier image of the other columns; its arrays are written to and its work is added
     record_passes : also report, per list entry, whether it passed in a pixel still live
     """
     counters = np.zeros((_COUNTERS, grid.tiles_y, grid.tiles_x), np.int32)
@@ -168,11 +176,10 @@ def rasterise(
         image, transmittance = onto.image, onto.transmittance
     live_passes = np.zeros(len(lists.splats) if record_passes else 0, np.uint8)
     first, last = columns or (0, grid.tiles_x)
-    run_chunks(
-        _raster_rows,
-        grid.tiles_y,
+    job = _Job(
         grid.tile_px,
-        (first, last),
+        first,
+        last,
         grid.tiles_x,
         features,
         lists.offsets,
@@ -183,6 +190,7 @@ def rasterise(
         counters,
         live_passes,
     )
+    run_chunks(_raster_rows, grid.tiles_y, job)
     entries = np.zeros_like(counters[0])
     entries[:, first:last] = lists.lengths[:, first:last]
     new = [entries, *counters]

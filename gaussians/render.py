@@ -47,9 +47,10 @@ def render_stereo(
 ) -> StereoFrame:
     """Render both eyes of ``rig`` by a stereo method.
 
-    With ellipse lists the left image, and the right one of `independent` and `exact`, are functions of
-    (scene, rig, background) alone, bit for bit. ``compare`` also renders the right eye from its own
-    projection and its own lists of the method's intersection rule: what the method is judged against.
+    With ellipse lists the left image, and the right one of `independent` and `exact`, are functions
+    of (scene, rig, background) alone, bit for bit. ``compare`` also renders the right eye from its
+    own projection and its own lists of the method's intersection rule: what the method is judged
+    against.
     """
     grid = TileGrid(rig.display.width, rig.display.height, tile_px)
     splats = project(scene, rig)

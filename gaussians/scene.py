@@ -109,8 +109,8 @@ def concatenate(scenes: list[Scene]) -> Scene:
         raise InputError("concatenate needs at least one scene")
     coefficients = max(s.sh.shape[1] for s in scenes)
     harmonics = [np.pad(s.sh, ((0, 0), (0, coefficients - s.sh.shape[1]), (0, 0))) for s in scenes]
-    plain = [np.concatenate([getattr(s, field) for s in scenes]) for field in FIELDS[:-1]]
-    return Scene(*plain, np.concatenate(harmonics))
+    joined = {f: np.concatenate([getattr(s, f) for s in scenes]) for f in FIELDS[:-1]}
+    return Scene(**joined, sh=np.concatenate(harmonics))
 
 
 def normalised_quaternions(quaternions: NDArray[np.floating], name: str = "scene") -> Float32:

@@ -9,7 +9,7 @@ _BUCKETS = 1 << _DIGIT_BITS
 
 
 @njit(cache=True, error_model="numpy")
-def _radix_sort(keys, order):  # type: ignore[no-untyped-def]
+def _radix_sort(keys: NDArray[np.uint32], order: NDArray[np.int32]) -> NDArray[np.int32]:
     """Stable least-significant-digit radix sort of uint32 keys; permutes order alike."""
     count = keys.shape[0]
     other_keys = np.empty_like(keys)

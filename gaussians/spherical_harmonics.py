@@ -15,7 +15,16 @@ _C30, _C31, _C32, _C33, _C34, _C35, _C36 = SH_C3
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _colour(begin, end, ids, needed, means, sh, eye, features):  # type: ignore[no-untyped-def]
+def _colour(
+    begin: int,
+    end: int,
+    ids: NDArray[np.int32],
+    needed: NDArray[np.bool_],
+    means: NDArray[np.float32],
+    sh: NDArray[np.float32],
+    eye: NDArray[np.float32],
+    features: NDArray[np.float32],
+) -> None:
     coefficients = sh.shape[1]
     for rank in range(begin, end):
         if not needed[rank]:

@@ -1,19 +1,20 @@
 """Stereo rasterisation: how the right eye's tile lists follow from the left eye's (Sec. 4.4).
 
-A left tile forwards splats to right tiles through K rows of first-in-first-out lists, row k holding what
-moves left by k tiles; a right tile merges its K lists by depth rank. Three presets:
+A left tile forwards splats to right tiles through K rows of first-in-first-out lists, row k holding
+what moves left by k tiles; a right tile merges its K lists by depth rank. Three presets:
 
 * ``independent``: the right eye bins for itself; the reference.
-* ``paper``: the method as written. What passes the alpha check of a live left pixel is forwarded once, to
-  row floor(disparity / tile); four rows; left conic and colour reused. Not exact.
-* ``exact``: the carrier rule. Every (splat, right tile) pair of the right eye's own footprint is carried by
-  exactly one left tile and row. Right lists equal the independent ones, list for list.
+* ``paper``: the method as written. What passes the alpha check of a live left pixel is forwarded
+  once, to row floor(disparity / tile); four rows; left conic and colour reused. Not exact.
+* ``exact``: the carrier rule. Every (splat, right tile) pair of the right eye's own footprint is
+  carried by exactly one left tile and row. Right lists equal the independent ones, list for list.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numba import njit
@@ -64,8 +65,8 @@ class StereoMethod:
         if self.forwarding == "none":
             return f"{self.name}: both eyes binned independently, {self.intersection} lists"
         return (
-            f"{self.name}: forward by {self.forwarding}, {self.rows} rows, {self.intersection} lists, "
-            f"conic {self.conic}, colour {self.colour}, centre {self.centre}, "
+            f"{self.name}: forward by {self.forwarding}, {self.rows} rows, {self.intersection}
+            lists, " f"conic {self.conic}, colour {self.colour}, centre {self.centre}, "
             f"{self.independent_edge_tiles} independent edge tiles"
         )
 
@@ -96,92 +97,101 @@ class StereoForwarding:
     duplicates: int
 
 
+class _Fifos(NamedTuple):
+    """The K rows of first-in-first-out lists: counted in a first pass, filled in a second."""
+
+    fill: bool
+    rows: int
+    shift: int  # right-window column + shift = column of the image plane (left window)
+    tiles_x: int
+    tiles_moved: NDArray[np.int32]  # [M] disparity in tiles, rounded as the rule asks
+    counts: NDArray[np.int32]  # [K, tiles_y, tiles_x], first pass
+    cursors: NDArray[np.int64]  # [K, tiles_y, tiles_x], second pass
+    entries: NDArray[np.int32]  # ranks, second pass
+
+
+@njit(cache=True, error_model="numpy")
+def _push(fifos: _Fifos, rank: int, k: int, row: int, column: int) -> None:
+    if fifos.fill:
+        fifos.entries[fifos.cursors[k, row, column]] = rank
+        fifos.cursors[k, row, column] += 1
+    else:
+        fifos.counts[k, row, column] += 1
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
 def _carry(
-    begin,
-    end,
-    fill,
-    rows,
-    shift,
-    tiles_x,
-    row_offsets,
-    ranks,
-    left,
-    right,
-    tiles_moved,
-    counts,
-    forward_only,
-    starts,
-    fifo,
-):  # type: ignore[no-untyped-def]
-    """Carrier rule. Scans a tile row in depth order, so every FIFO receives its entries in rank order:
-    FIFO (k, t) has one source, left tile t + k, whose own list has the same order."""
-    lowest, highest = (
-        min(0, shift),
-        max(tiles_x - 1, tiles_x - 1 + shift),
-    )  # columns of the image plane
+    begin: int,
+    end: int,
+    fifos: _Fifos,
+    row_offsets: NDArray[np.int64],
+    ranks: NDArray[np.int32],
+    left: NDArray[np.int16],
+    right: NDArray[np.int16],
+    forward_only: NDArray[np.int32],
+) -> int:
+    """Carrier rule. Scans a tile row in depth order, so every FIFO receives its entries in rank
+    order: FIFO (k, t) has one source, left tile t + k, whose own list has the same order."""
+    shift = fifos.shift
+    lowest = min(0, shift)  # first and last tile column of the image plane
+    highest = max(fifos.tiles_x - 1, fifos.tiles_x - 1 + shift)
     for row in range(begin, end):
         for entry in range(row_offsets[row], row_offsets[row + 1]):
             rank = ranks[entry]
             left_first, left_last = left[entry, 0], left[entry, 1]
             for column in range(right[entry, 0], right[entry, 1] + 1):
                 target = column + shift
-                carrier = target + tiles_moved[rank]
+                carrier = target + fifos.tiles_moved[rank]
                 if left_first <= left_last:
                     carrier = min(max(carrier, left_first), left_last)
-                carrier = min(max(carrier, target), target + rows - 1, highest)
-                k = carrier - target
-                if fill:
-                    fifo[starts[k, row, column]] = rank
-                    starts[k, row, column] += 1
-                else:
-                    counts[k, row, column] += 1
-                    if not left_first <= carrier <= left_last:
-                        forward_only[row, carrier - lowest] += 1
+                carrier = min(max(carrier, target), target + fifos.rows - 1, highest)
+                _push(fifos, rank, carrier - target, row, column)
+                if not fifos.fill and not left_first <= carrier <= left_last:
+                    forward_only[row, carrier - lowest] += 1
+    return 0
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _forward_passes(
-    begin,
-    end,
-    fill,
-    rows,
-    shift,
-    first_edge,
-    tiles_x,
-    tile_offsets,
-    splats,
-    live_passes,
-    tiles_moved,
-    counts,
-    starts,
-    fifo,
-):  # type: ignore[no-untyped-def]
+    begin: int,
+    end: int,
+    fifos: _Fifos,
+    first_edge: int,
+    tile_offsets: NDArray[np.int64],
+    splats: NDArray[np.int32],
+    live_passes: NDArray[np.uint8],
+) -> int:
     """The paper's rule; returns how many forwards found no row (disparity of K tiles and more)."""
     dropped = 0
     for row in range(begin, end):
-        for column in range(tiles_x):
-            tile = row * tiles_x + column
+        for column in range(fifos.tiles_x):
+            tile = row * fifos.tiles_x + column
             for entry in range(tile_offsets[tile], tile_offsets[tile + 1]):
                 if live_passes[entry] == 0:
                     continue
-                rank = splats[entry]
-                k = tiles_moved[rank]
-                target = column - k - shift
-                if k >= rows:
+                k = fifos.tiles_moved[splats[entry]]
+                target = column - k - fifos.shift
+                if k >= fifos.rows:
                     dropped += 1
                 elif 0 <= target < first_edge:
-                    if fill:
-                        fifo[starts[k, row, target]] = rank
-                        starts[k, row, target] += 1
-                    else:
-                        counts[k, row, target] += 1
+                    _push(fifos, splats[entry], k, row, target)
     return dropped
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _merge(begin, end, rows, tiles_x, starts, ends, fifo, tile_offsets, merged, lengths):  # type: ignore[no-untyped-def]
-    """Merge unit: K sorted heads, smallest rank first; equal heads pop together. Returns duplicates."""
+def _merge(
+    begin: int,
+    end: int,
+    starts: NDArray[np.int64],
+    ends: NDArray[np.int64],
+    fifo: NDArray[np.int32],
+    tile_offsets: NDArray[np.int64],
+    merged: NDArray[np.int32],
+    lengths: NDArray[np.int32],
+) -> int:
+    """Merge unit: K sorted heads, smallest rank first; equal heads pop together. Returns
+    duplicates."""
+    rows, _tiles_y, tiles_x = starts.shape
     heads = np.empty(rows, np.int64)
     duplicates = 0
     for row in range(begin, end):
@@ -250,35 +260,24 @@ def forward(
     forward_only = np.zeros((grid.tiles_y, grid.tiles_x + abs(shift)), np.int32)
     in_tiles = disparity_px(splats, rig) / np.float32(grid.tile_px)
     limit = grid.tiles_x + abs(shift) + method.rows  # farther moves all behave alike
+    kernel: Callable[..., int]
     if method.forwarding == "carrier":
-        moved = np.minimum(np.ceil(in_tiles), limit).astype(np.int32)
-        fixed = (method.rows, shift, grid.tiles_x, rows.offsets, rows.ranks, *rows.spans, moved)
-        counting: tuple = (_carry, fixed, (counts, forward_only))
+        kernel, rounded = _carry, np.ceil(in_tiles)
+        arguments: tuple[Any, ...] = (rows.offsets, rows.ranks, *rows.spans, forward_only)
     else:
-        moved = np.minimum(np.floor(in_tiles), limit).astype(np.int32)
+        kernel, rounded = _forward_passes, np.floor(in_tiles)
         first_edge = grid.tiles_x - method.independent_edge_tiles
-        fixed = (
-            method.rows,
-            shift,
-            first_edge,
-            grid.tiles_x,
-            left.offsets,
-            left.splats,
-            live_passes,
-            moved,
-        )
-        counting = (_forward_passes, fixed, (counts,))
-    kernel, fixed, counters = counting
-    nothing = (np.zeros(shape, np.int64), np.zeros(0, np.int32))
-    dropped = run_chunks(kernel, grid.tiles_y, False, *fixed, *counters, *nothing)
+        arguments = (first_edge, left.offsets, left.splats, live_passes)
+    moved = np.minimum(rounded, limit).astype(np.int32)
+    setting = (method.rows, shift, grid.tiles_x, moved, counts)
+    counting = _Fifos(False, *setting, np.zeros(shape, np.int64), np.zeros(0, np.int32))
+    dropped = sum(run_chunks(kernel, grid.tiles_y, counting, *arguments))
     ends = offsets_of(counts)[1:].reshape(shape)
     starts = ends - counts
-    fifo = np.empty(ends[-1, -1, -1], np.int32)
-    run_chunks(kernel, grid.tiles_y, True, *fixed, *counters, starts.copy(), fifo)
-    lists, duplicates = _merged_lists(starts, ends, fifo, counts)
-    return StereoForwarding(
-        lists, counts, forward_only, sum(d for d in dropped if d is not None), duplicates
-    )
+    filling = _Fifos(True, *setting, starts.copy(), np.empty(ends[-1, -1, -1], np.int32))
+    run_chunks(kernel, grid.tiles_y, filling, *arguments)
+    lists, duplicates = _merged_lists(starts, ends, filling.entries, counts)
+    return StereoForwarding(lists, counts, forward_only, dropped, duplicates)
 
 
 def _merged_lists(
@@ -287,11 +286,11 @@ def _merged_lists(
     fifo: NDArray[np.int32],
     counts: NDArray[np.int32],
 ) -> tuple[TileLists, int]:
-    rows, tiles_y, tiles_x = counts.shape
+    _rows, tiles_y, tiles_x = counts.shape
     offsets = offsets_of(counts.sum(axis=0))
     merged = np.full(offsets[-1], -1, np.int32)
     lengths = np.empty((tiles_y, tiles_x), np.int32)
-    arguments = (rows, tiles_x, starts, ends, fifo, offsets, merged, lengths)
+    arguments = (starts, ends, fifo, offsets, merged, lengths)
     duplicates = sum(run_chunks(_merge, tiles_y, *arguments))
     if duplicates:
         merged, offsets = merged[merged >= 0], offsets_of(lengths)

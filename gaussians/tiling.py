@@ -1,15 +1,15 @@
 """Binning: which tiles a splat may touch, and the depth-ordered list of every tile.
 
-Row lists come first and are shared by both eyes: on a rectified rig v, c_yy and the opacity have the same
-bits in both eyes. Then each eye's own horizontal span per tile row. Spans are computed in float64 from the
-float32 conic and are conservative by the bound stated in conventions.md.
+Row lists come first and are shared by both eyes: on a rectified rig v, c_yy and the opacity have
+the same bits in both eyes. Then each eye's own horizontal span per tile row. Spans are computed in
+float64 from the float32 conic and are conservative by the bound stated in conventions.md.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numba import njit
@@ -19,6 +19,7 @@ from gaussians.errors import InputError
 from gaussians.parallel import run_chunks
 from gaussians.projection import CONIC_A, CONIC_B, CONIC_C, THRESHOLD, ProjectedSplats, U, V
 
+Float32 = NDArray[np.float32]
 Intersection = Literal["ellipse", "square_3sigma", "obb"]
 INTERSECTIONS: tuple[str, ...] = get_args(Intersection)
 _ELLIPSE, _SQUARE = 0, 1
@@ -53,7 +54,8 @@ class TileGrid:
 
 @dataclass(frozen=True)
 class TileLists:
-    """Depth-ordered splat ranks per tile, row-major: tile i holds splats[offsets[i]:offsets[i + 1]]."""
+    """Depth-ordered splat ranks per tile, row-major: tile i holds splats[offsets[i]:offsets[i +
+    1]]."""
 
     tiles_x: int
     tiles_y: int
@@ -78,8 +80,19 @@ class RowSpans:
     ill_conditioned: int  # splats whose region is unbounded by rounding
 
 
+class _Job(NamedTuple):
+    """What the binning kernels read."""
+
+    rule: int
+    tile: int
+    width: int
+    height: int
+    features: Float32  # [eyes, M, 10]
+    covariances: Float32  # [eyes, M, 3]
+
+
 @njit(cache=True, error_model="numpy")
-def _square_radius(cxx, cxy, cyy):  # type: ignore[no-untyped-def]
+def _square_radius(cxx: float, cxy: float, cyy: float) -> float:
     """INRIA: ceil(3 sqrt(largest eigenvalue)), with its floor of 0.1 under the root."""
     middle = 0.5 * (cxx + cyy)
     largest = middle + math.sqrt(max(0.1, middle * middle - (cxx * cyy - cxy * cxy)))
@@ -87,7 +100,7 @@ def _square_radius(cxx, cxy, cyy):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _box_axes(cxx, cxy, cyy):  # type: ignore[no-untyped-def]
+def _box_axes(cxx: float, cxy: float, cyy: float) -> tuple[float, float, float, float]:
     """GSCore's oriented box: half axes (x1, y1), (x2, y2) of three standard deviations."""
     middle = 0.5 * (cxx + cyy)
     spread = math.sqrt(max(0.0, middle * middle - (cxx * cyy - cxy * cxy)))
@@ -99,7 +112,7 @@ def _box_axes(cxx, cxy, cyy):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _half_height(rule, feature, covariance):  # type: ignore[no-untyped-def]
+def _half_height(rule: int, feature: Float32, covariance: Float32) -> float:
     """Vertical half extent in px; infinite where rounding leaves the ellipse unbounded."""
     if rule == _ELLIPSE:
         a = np.float64(feature[CONIC_A]) * (1.0 - _ROUNDING)
@@ -121,7 +134,7 @@ def _half_height(rule, feature, covariance):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _ellipse_interval(feature, low, high):  # type: ignore[no-untyped-def]
+def _ellipse_interval(feature: Float32, low: float, high: float) -> tuple[float, float]:
     """x interval, relative to u, of the pass region over dy in [low, high]."""
     a = np.float64(feature[CONIC_A]) * (1.0 - _ROUNDING)
     b = np.float64(feature[CONIC_B])
@@ -149,8 +162,9 @@ def _ellipse_interval(feature, low, high):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _box_interval(covariance, low, high):  # type: ignore[no-untyped-def]
-    """x interval of the oriented box over dy in [low, high]: corners inside, edges cut by the slab."""
+def _box_interval(covariance: Float32, low: float, high: float) -> tuple[float, float]:
+    """x interval of the oriented box over dy in [low, high]: corners inside, edges cut by the
+    slab."""
     x1, y1, x2, y2 = _box_axes(
         np.float64(covariance[0]), np.float64(covariance[1]), np.float64(covariance[2])
     )
@@ -175,7 +189,9 @@ def _box_interval(covariance, low, high):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _column_span(rule, feature, covariance, row, tile, width, height):  # type: ignore[no-untyped-def]
+def _column_span(
+    rule: int, feature: Float32, covariance: Float32, row: int, tile: int, width: int, height: int
+) -> tuple[int, int]:
     """First and last tile column of a splat in a tile row; first > last when it touches none."""
     u, v = np.float64(feature[U]), np.float64(feature[V])
     top = row * tile
@@ -212,32 +228,36 @@ def _column_span(rule, feature, covariance, row, tile, width, height):  # type: 
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _row_range(begin, end, rule, tile, height, features, covariances, rows):  # type: ignore[no-untyped-def]
+def _row_range(begin: int, end: int, job: _Job, rows: NDArray[np.int32]) -> int:
     """rows [M, 2]: first and last tile row, the union over eyes; returns the unbounded splats."""
     unbounded = 0
     for rank in range(begin, end):
         half = 0.0
-        for eye in range(features.shape[0]):
-            half = max(half, _half_height(rule, features[eye, rank], covariances[eye, rank]))
+        for eye in range(job.features.shape[0]):
+            half = max(
+                half, _half_height(job.rule, job.features[eye, rank], job.covariances[eye, rank])
+            )
         if half == np.inf:
             unbounded += 1
-        v = np.float64(features[0, rank, V])
+        v = np.float64(job.features[0, rank, V])
         low = max(v - half - 0.5 - _SLACK_PX, -1.0)
-        high = min(v + half - 0.5 + _SLACK_PX, np.float64(height))
-        if rule == _ELLIPSE:  # only rows of pixel centres count
+        high = min(v + half - 0.5 + _SLACK_PX, np.float64(job.height))
+        if job.rule == _ELLIPSE:  # only rows of pixel centres count
             first_px, last_px = math.ceil(low), math.floor(high)
         else:
             first_px, last_px = math.floor(low), math.ceil(high)
-        if first_px > last_px or last_px < 0 or first_px >= height:
+        if first_px > last_px or last_px < 0 or first_px >= job.height:
             rows[rank, 0], rows[rank, 1] = 1, 0
         else:
-            rows[rank, 0] = max(first_px, 0) // tile
-            rows[rank, 1] = min(last_px, height - 1) // tile
+            rows[rank, 0] = max(first_px, 0) // job.tile
+            rows[rank, 1] = min(last_px, job.height - 1) // job.tile
     return unbounded
 
 
 @njit(cache=True, error_model="numpy")
-def _row_lists(rows, tiles_y):  # type: ignore[no-untyped-def]
+def _row_lists(
+    rows: NDArray[np.int32], tiles_y: int
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """Counting sort of the splats into tile rows, depth order kept."""
     offsets = np.zeros(tiles_y + 1, np.int64)
     for rank in range(rows.shape[0]):
@@ -256,14 +276,26 @@ def _row_lists(rows, tiles_y):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _spans(
-    begin, end, rule, tile, width, height, features, covariances, offsets, ranks, spans, counts
-):  # type: ignore[no-untyped-def]
+    begin: int,
+    end: int,
+    job: _Job,
+    offsets: NDArray[np.int64],
+    ranks: NDArray[np.int32],
+    spans: NDArray[np.int16],
+    counts: NDArray[np.int32],
+) -> None:
     for row in range(begin, end):
-        for eye in range(features.shape[0]):
+        for eye in range(job.features.shape[0]):
             for entry in range(offsets[row], offsets[row + 1]):
                 rank = ranks[entry]
                 first, last = _column_span(
-                    rule, features[eye, rank], covariances[eye, rank], row, tile, width, height
+                    job.rule,
+                    job.features[eye, rank],
+                    job.covariances[eye, rank],
+                    row,
+                    job.tile,
+                    job.width,
+                    job.height,
                 )
                 spans[eye, entry, 0], spans[eye, entry, 1] = first, last
                 for column in range(first, last + 1):
@@ -271,7 +303,16 @@ def _spans(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _fill(begin, end, row_offsets, ranks, spans, tile_offsets, tiles_x, splats):  # type: ignore[no-untyped-def]
+def _fill(
+    begin: int,
+    end: int,
+    row_offsets: NDArray[np.int64],
+    ranks: NDArray[np.int32],
+    spans: NDArray[np.int16],
+    tile_offsets: NDArray[np.int64],
+    tiles_x: int,
+    splats: NDArray[np.int32],
+) -> None:
     for row in range(begin, end):
         cursor = tile_offsets[row * tiles_x : (row + 1) * tiles_x].copy()
         for entry in range(row_offsets[row], row_offsets[row + 1]):
@@ -285,19 +326,18 @@ def row_spans(
 ) -> RowSpans:
     """Bin splats into tile rows and compute every eye's column span in each.
 
-    ``ellipse``: the opacity-aware contour p = threshold against pixel centres, exact up to the stated
-    rounding bound. ``square_3sigma``: INRIA's square of radius ceil(3 sigma_max). ``obb``: GSCore's
-    oriented box of three sigmas. The last two drop contributions that the ellipse keeps.
+    ``ellipse``: the opacity-aware contour p = threshold against pixel centres, exact up to the
+    stated rounding bound. ``square_3sigma``: INRIA's square of radius ceil(3 sigma_max). ``obb``:
+    GSCore's oriented box of three sigmas. The last two drop contributions that the ellipse keeps.
     """
     rule = INTERSECTIONS.index(intersection)
+    job = _Job(rule, grid.tile_px, grid.width, grid.height, splats.features, splats.covariances)
     rows = np.empty((len(splats.ids), 2), np.int32)
-    arrays = (splats.features, splats.covariances)
-    unbounded = run_chunks(_row_range, len(rows), rule, grid.tile_px, grid.height, *arrays, rows)
+    unbounded = run_chunks(_row_range, len(rows), job, rows)
     offsets, ranks = _row_lists(rows, grid.tiles_y)
     spans = np.empty((splats.eyes, len(ranks), 2), np.int16)
     counts = np.zeros((splats.eyes, grid.tiles_y, grid.tiles_x), np.int32)
-    size = (grid.tile_px, grid.width, grid.height)
-    run_chunks(_spans, grid.tiles_y, rule, *size, *arrays, offsets, ranks, spans, counts)
+    run_chunks(_spans, grid.tiles_y, job, offsets, ranks, spans, counts)
     return RowSpans(grid, offsets, ranks, spans, counts, sum(unbounded))
 
 

@@ -1,6 +1,7 @@
 """The work trace: what rendering one stereo frame took, per tile and eye. Counted, never assumed.
 
-The cycle model turns these counts into time and activity; it has no other source of scene statistics.
+The cycle model turns these counts into time and activity; it has no other source of scene
+statistics.
 """
 
 from __future__ import annotations
