@@ -63,7 +63,7 @@ class Scene:
             array = getattr(self, field)
             if array.dtype != np.float32:
                 raise InputError(f"{name}: {field} must be float32, not {array.dtype}")
-            finite = np.isfinite(array).reshape(count, -1).all(axis=1)
+            finite = np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
             if not finite.all():
                 bad = int(np.argmin(finite))
                 raise InputError(
