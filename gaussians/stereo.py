@@ -65,9 +65,9 @@ class StereoMethod:
         if self.forwarding == "none":
             return f"{self.name}: both eyes binned independently, {self.intersection} lists"
         return (
-            f"{self.name}: forward by {self.forwarding}, {self.rows} rows, {self.intersection}
-            lists, " f"conic {self.conic}, colour {self.colour}, centre {self.centre}, "
-            f"{self.independent_edge_tiles} independent edge tiles"
+            f"{self.name}: forward by {self.forwarding}, {self.rows} rows, "
+            f"{self.intersection} lists, conic {self.conic}, colour {self.colour}, "
+            f"centre {self.centre}, {self.independent_edge_tiles} independent edge tiles"
         )
 
 
