@@ -33,6 +33,7 @@ class StereoFrame:
     right_lists: TileLists
     ids: NDArray[np.int32]  # rank -> id in the scene
     work: FrameWork
+    visible: tuple[int, int]  # splats in at least one tile of the left and of the right eye
     independent_right: Float32 | None = None  # right eye rendered on its own, where asked for
 
 
@@ -56,6 +57,7 @@ def render_stereo(
     splats = project(scene, rig)
     rows = row_spans(splats, grid, method.intersection)
     visible = _colour(scene, rig, splats, rows)
+    in_eyes = int(visible[0].sum()), int(visible[1].sum())
     left_lists = tile_lists(rows, 0)
     paper = method.forwarding == "live_alpha_pass"
     left = rasterise(splats.features[0], left_lists, grid, background, record_passes=paper)
@@ -78,7 +80,10 @@ def render_stereo(
         left_lists,
         right_lists,
         splats.ids,
-        _frame_work(scene, method, splats, rows, visible, left, right, forwarding),
+        _frame_work(
+            scene, method, splats, rows, int(visible.any(0).sum()), left, right, forwarding
+        ),
+        in_eyes,
         own_right,
     )
 
@@ -95,16 +100,18 @@ def render_mono(
     return eye.image, eye.transmittance
 
 
-def _colour(scene: Scene, rig: StereoRig, splats: ProjectedSplats, rows: RowSpans) -> int:
-    """Fill the colours of the splats that stand in a tile of either eye; return their number."""
-    needed = np.zeros(len(splats.ids), np.bool_)
-    touched = (rows.spans[:, :, 0] <= rows.spans[:, :, 1]).any(axis=0)
-    needed[rows.ranks[touched]] = True
-    for features, eye in zip(
-        splats.features, (rig.left_position, rig.right_position), strict=False
-    ):
-        fill_colours(features, splats.ids, needed, scene.means, scene.sh, eye)
-    return int(needed.sum())
+def _colour(
+    scene: Scene, rig: StereoRig, splats: ProjectedSplats, rows: RowSpans
+) -> NDArray[np.bool_]:
+    """[eyes, M] which splats stand in a tile; fills the colours of those that stand in any."""
+    visible = np.zeros((splats.eyes, len(splats.ids)), np.bool_)
+    for eye, spans in zip(visible, rows.spans, strict=True):
+        eye[rows.ranks[spans[:, 0] <= spans[:, 1]]] = True
+    needed = np.any(visible, axis=0)
+    positions = (rig.left_position, rig.right_position)
+    for features, position in zip(splats.features, positions, strict=False):
+        fill_colours(features, splats.ids, needed, scene.means, scene.sh, position)
+    return visible
 
 
 def _right_eye(

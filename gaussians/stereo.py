@@ -189,8 +189,7 @@ def _merge(
     merged: NDArray[np.int32],
     lengths: NDArray[np.int32],
 ) -> int:
-    """Merge unit: K sorted heads, smallest rank first; equal heads pop together. Returns
-    duplicates."""
+    """Merge unit: K sorted heads, smallest rank first, equal heads together; returns duplicates."""
     rows, _tiles_y, tiles_x = starts.shape
     heads = np.empty(rows, np.int64)
     duplicates = 0
