@@ -1,7 +1,8 @@
 """Constants of the splatting mathematics, once, in float32.
 
-Kernels use these module-level ``np.float32`` values only: a Python float inside a kernel would promote
-the operation to float64 under numba but not under NumPy. Their use is written down in conventions.md.
+Kernels use these module-level ``np.float32`` values only: a Python float inside a kernel would
+promote the operation to float64 under numba but not under NumPy. Their use is written down in
+conventions.md.
 """
 
 import numpy as np
@@ -38,3 +39,7 @@ SH_C3 = np.array(
     ],
     np.float32,
 )
+
+# Columns of a feature record: the ten words a rendering unit needs of one splat
+U, V, CONIC_A, CONIC_B, CONIC_C, THRESHOLD, OPACITY, RED, GREEN, BLUE = range(10)
+FEATURES = 10

@@ -1,6 +1,6 @@
 """How a head moves while standing, walking, flying and teleporting: generated traces.
 
-Amplitudes and frequencies are round numbers of ordinary human movement, not fitted to any recording;
+Amplitudes and frequencies are round numbers of ordinary human movement, not fitted to a recording;
 recorded traces are there for that.
 """
 

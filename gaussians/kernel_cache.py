@@ -10,7 +10,11 @@ import os
 import sys
 from pathlib import Path
 
-SHARED_SOURCES = ("gaussians/float32_math.py", "lod_cloud/criterion.py")
+SHARED_SOURCES = (
+    "gaussians/float32_math.py",
+    "gaussians/footprints.py",
+    "lod_cloud/criterion.py",
+)
 
 
 def configure() -> Path:

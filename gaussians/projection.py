@@ -10,17 +10,24 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gaussians.cameras import StereoRig
-from gaussians.constants import DILATION_PX2, OPACITY_MIN
+from gaussians.constants import (
+    CONIC_A,
+    CONIC_B,
+    CONIC_C,
+    DILATION_PX2,
+    FEATURES,
+    OPACITY,
+    OPACITY_MIN,
+    THRESHOLD,
+    U,
+    V,
+)
 from gaussians.float32_math import ln_float64
 from gaussians.parallel import run_chunks
 from gaussians.scene import Scene
 from gaussians.sorting import depth_order
 
 Float32 = NDArray[np.float32]
-
-# Columns of a feature record, what a rendering unit needs of one splat: ten words
-U, V, CONIC_A, CONIC_B, CONIC_C, THRESHOLD, OPACITY, RED, GREEN, BLUE = range(10)
-FEATURES = 10
 
 _ONE, _TWO = np.float32(1), np.float32(2)
 _INFINITY = np.float32(np.inf)
@@ -118,7 +125,7 @@ def _project(begin: int, end: int, job: _Job) -> None:
         v = job.fy * ty + job.cy
         threshold = _threshold(job.opacities[i])
         good = True
-        for eye in range(job.features.shape[0]):
+        for eye in range(2):
             x_eye = x_left - job.baseline if eye == 1 else x_left
             cx = job.cx_right if eye == 1 else job.cx_left
             tx = x_eye / z
@@ -132,6 +139,8 @@ def _project(begin: int, end: int, job: _Job) -> None:
             det = wide_xx * wide_yy - wide_xy * wide_xy
             if not (det > 0.0 and det < np.inf):
                 good = False
+                continue
+            if eye >= job.features.shape[0]:
                 continue
             job.covariances[eye, rank, 0] = cxx
             job.covariances[eye, rank, 1] = cxy
@@ -157,8 +166,8 @@ def camera_depths(scene: Scene, rig: StereoRig) -> Float32:
 def project(scene: Scene, rig: StereoRig, *, eyes: int = 2) -> ProjectedSplats:
     """Cull, sort by depth and project; colours (features 7 to 9) are left at zero.
 
-    Depth, opacity and determinant culls are decided once for both eyes and counted. With ``eyes=1``
-    only the left eye is computed, and its determinant alone decides.
+    Depth, opacity and determinant culls are decided once for both eyes and counted, also with
+    ``eyes=1``, which keeps the results of the left eye only.
     """
     depths = camera_depths(scene, rig)
     in_front = (depths >= np.float32(rig.near_m)) & (depths < np.inf)

@@ -9,10 +9,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from gaussians.constants import ALPHA_MAX, TRANSMITTANCE_STOP
-from gaussians.float32_math import exp_float32
-from gaussians.parallel import run_chunks
-from gaussians.projection import (
+from gaussians.constants import (
+    ALPHA_MAX,
     BLUE,
     CONIC_A,
     CONIC_B,
@@ -21,9 +19,12 @@ from gaussians.projection import (
     OPACITY,
     RED,
     THRESHOLD,
+    TRANSMITTANCE_STOP,
     U,
     V,
 )
+from gaussians.float32_math import exp_float32
+from gaussians.parallel import run_chunks
 from gaussians.tiling import TileGrid, TileLists
 from gaussians.work import EyeWork
 

@@ -4,9 +4,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from gaussians.constants import SH_C0, SH_C1, SH_C2, SH_C3
+from gaussians.constants import RED, SH_C0, SH_C1, SH_C2, SH_C3
 from gaussians.parallel import run_chunks
-from gaussians.projection import RED
 
 _ZERO, _HALF = np.float32(0), np.float32(0.5)
 _TWO, _THREE, _FOUR = np.float32(2), np.float32(3), np.float32(4)

@@ -21,10 +21,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gaussians.cameras import StereoRig
+from gaussians.constants import BLUE, CONIC_A, CONIC_C, RED, U
 from gaussians.errors import InputError
+from gaussians.footprints import INTERSECTIONS, Intersection
 from gaussians.parallel import run_chunks
-from gaussians.projection import BLUE, CONIC_A, CONIC_C, RED, ProjectedSplats, U
-from gaussians.tiling import INTERSECTIONS, Intersection, RowSpans, TileLists, offsets_of
+from gaussians.projection import ProjectedSplats
+from gaussians.tiling import RowSpans, TileLists, offsets_of
 
 Forwarding = Literal["none", "live_alpha_pass", "carrier"]
 PerEye = Literal["per_eye", "left"]
@@ -105,18 +107,9 @@ class _Fifos(NamedTuple):
     shift: int  # right-window column + shift = column of the image plane (left window)
     tiles_x: int
     tiles_moved: NDArray[np.int32]  # [M] disparity in tiles, rounded as the rule asks
-    counts: NDArray[np.int32]  # [K, tiles_y, tiles_x], first pass
-    cursors: NDArray[np.int64]  # [K, tiles_y, tiles_x], second pass
-    entries: NDArray[np.int32]  # ranks, second pass
-
-
-@njit(cache=True, error_model="numpy")
-def _push(fifos: _Fifos, rank: int, k: int, row: int, column: int) -> None:
-    if fifos.fill:
-        fifos.entries[fifos.cursors[k, row, column]] = rank
-        fifos.cursors[k, row, column] += 1
-    else:
-        fifos.counts[k, row, column] += 1
+    counts: NDArray[np.int32]  # [tiles_y, tiles_x, K], first pass
+    cursors: NDArray[np.int64]  # [tiles_y, tiles_x, K], second pass
+    entries: NDArray[np.int32]  # ranks, second pass; FIFOs of one right tile lie side by side
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -132,22 +125,28 @@ def _carry(
 ) -> int:
     """Carrier rule. Scans a tile row in depth order, so every FIFO receives its entries in rank
     order: FIFO (k, t) has one source, left tile t + k, whose own list has the same order."""
-    shift = fifos.shift
+    shift, most, moved = fifos.shift, fifos.rows - 1, fifos.tiles_moved
     lowest = min(0, shift)  # first and last tile column of the image plane
     highest = max(fifos.tiles_x - 1, fifos.tiles_x - 1 + shift)
     for row in range(begin, end):
+        counts, cursors = fifos.counts[row], fifos.cursors[row]
         for entry in range(row_offsets[row], row_offsets[row + 1]):
             rank = ranks[entry]
             left_first, left_last = left[entry, 0], left[entry, 1]
             for column in range(right[entry, 0], right[entry, 1] + 1):
                 target = column + shift
-                carrier = target + fifos.tiles_moved[rank]
+                carrier = target + moved[rank]
                 if left_first <= left_last:
                     carrier = min(max(carrier, left_first), left_last)
-                carrier = min(max(carrier, target), target + fifos.rows - 1, highest)
-                _push(fifos, rank, carrier - target, row, column)
-                if not fifos.fill and not left_first <= carrier <= left_last:
-                    forward_only[row, carrier - lowest] += 1
+                carrier = min(max(carrier, target), target + most, highest)
+                k = carrier - target
+                if fifos.fill:
+                    fifos.entries[cursors[column, k]] = rank
+                    cursors[column, k] += 1
+                else:
+                    counts[column, k] += 1
+                    if not left_first <= carrier <= left_last:
+                        forward_only[row, carrier - lowest] += 1
     return 0
 
 
@@ -174,7 +173,11 @@ def _forward_passes(
                 if k >= fifos.rows:
                     dropped += 1
                 elif 0 <= target < first_edge:
-                    _push(fifos, splats[entry], k, row, target)
+                    if fifos.fill:
+                        fifos.entries[fifos.cursors[row, target, k]] = splats[entry]
+                        fifos.cursors[row, target, k] += 1
+                    else:
+                        fifos.counts[row, target, k] += 1
     return dropped
 
 
@@ -190,26 +193,29 @@ def _merge(
     lengths: NDArray[np.int32],
 ) -> int:
     """Merge unit: K sorted heads, smallest rank first, equal heads together; returns duplicates."""
-    rows, _tiles_y, tiles_x = starts.shape
-    heads = np.empty(rows, np.int64)
+    _tiles_y, tiles_x, rows = starts.shape
+    nothing = np.int32(2147483647)
+    heads = np.empty(rows, np.int32)  # what each row shows
+    places = np.empty(rows, np.int64)
     duplicates = 0
     for row in range(begin, end):
         for column in range(tiles_x):
+            ending = ends[row, column]
             for k in range(rows):
-                heads[k] = starts[k, row, column]
-            out = tile_offsets[row * tiles_x + column]
-            first_out = out
+                places[k] = starts[row, column, k]
+                heads[k] = fifo[places[k]] if places[k] < ending[k] else nothing
+            first_out = out = tile_offsets[row * tiles_x + column]
             while True:
-                best = np.int32(2147483647)
+                best = nothing
                 for k in range(rows):
-                    if heads[k] < ends[k, row, column]:
-                        best = min(best, fifo[heads[k]])
-                if best == 2147483647:
+                    best = min(best, heads[k])
+                if best == nothing:
                     break
                 popped = 0
                 for k in range(rows):
-                    while heads[k] < ends[k, row, column] and fifo[heads[k]] == best:
-                        heads[k] += 1
+                    if heads[k] == best:
+                        places[k] += 1
+                        heads[k] = fifo[places[k]] if places[k] < ending[k] else nothing
                         popped += 1
                 duplicates += popped - 1
                 merged[out] = best
@@ -254,7 +260,7 @@ def forward(
     """
     grid = rows.grid
     shift = round(rig.display.window_offset_px) // grid.tile_px
-    shape = (method.rows, grid.tiles_y, grid.tiles_x)
+    shape = (grid.tiles_y, grid.tiles_x, method.rows)
     counts = np.zeros(shape, np.int32)
     forward_only = np.zeros((grid.tiles_y, grid.tiles_x + abs(shift)), np.int32)
     in_tiles = disparity_px(splats, rig) / np.float32(grid.tile_px)
@@ -276,7 +282,8 @@ def forward(
     filling = _Fifos(True, *setting, starts.copy(), np.empty(ends[-1, -1, -1], np.int32))
     run_chunks(kernel, grid.tiles_y, filling, *arguments)
     lists, duplicates = _merged_lists(starts, ends, filling.entries, counts)
-    return StereoForwarding(lists, counts, forward_only, dropped, duplicates)
+    by_row = np.ascontiguousarray(np.moveaxis(counts, 2, 0))
+    return StereoForwarding(lists, by_row, forward_only, dropped, duplicates)
 
 
 def _merged_lists(
@@ -285,8 +292,8 @@ def _merged_lists(
     fifo: NDArray[np.int32],
     counts: NDArray[np.int32],
 ) -> tuple[TileLists, int]:
-    _rows, tiles_y, tiles_x = counts.shape
-    offsets = offsets_of(counts.sum(axis=0))
+    tiles_y, tiles_x, _rows = counts.shape
+    offsets = offsets_of(counts.sum(axis=2))
     merged = np.full(offsets[-1], -1, np.int32)
     lengths = np.empty((tiles_y, tiles_x), np.int32)
     arguments = (starts, ends, fifo, offsets, merged, lengths)

@@ -42,19 +42,19 @@ _AWNING_TINTS: tuple[Colour, ...] = ((0.62, 0.12, 0.12), (0.10, 0.30, 0.20), (0.
 
 
 def town(rng: np.random.Generator) -> Geometry:
-    """The whole town: streets, houses, trees, lamps, parked cars, clutter on the pavements."""
+    """The whole town: streets, houses, trees, lamps, parked cars, clutter; and soil below."""
     builder = GeometryBuilder(rng)
     add_town(builder)
+    _soil(builder)
     return builder.build()
 
 
 def add_town(builder: GeometryBuilder) -> None:
-    """Add the whole town to a builder (more objects may follow)."""
+    """Add the town, without the soil below it, to a builder (more objects may follow)."""
     _main_street(builder)
     _cross_street(builder)
     _parallel_streets(builder)
     _outskirts(builder)
-    _soil(builder)
     _blocks(builder)
     add_furniture(builder)
 

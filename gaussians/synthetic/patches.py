@@ -6,7 +6,7 @@ leaves. Both the city generator and the view-dependent benchmark scenes sample t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -88,6 +88,13 @@ class Geometry:
 
     patches: Patches
     crowns: Crowns
+
+    def moved(self, shift: Float64) -> Geometry:
+        """The same world, shifted by ``shift`` [3] metres."""
+        return Geometry(
+            replace(self.patches, origins=self.patches.origins + shift),
+            replace(self.crowns, centres=self.crowns.centres + shift),
+        )
 
 
 class GeometryBuilder:

@@ -50,7 +50,7 @@ class Shape:
 
 def opaque(rng: np.random.Generator, count: int) -> Float64:
     """[count] opacities near 1."""
-    return 0.955 + 0.044 * rng.random(count)
+    return 0.90 + 0.095 * rng.random(count)
 
 
 def translucent(rng: np.random.Generator, count: int) -> Float64:

@@ -1,0 +1,373 @@
+"""Number formats of the Gaussian stream: 16-bit fixed point per field, a codebook for the harmonics.
+
+The paper's coding (Sec. 4.3): attributes are coded independently of each other; every attribute is
+16-bit fixed point but the spherical harmonics above degree 0 ("AC"), which are vector-quantised. Where
+the paper names no range, the range comes from the scene, and a value outside it is reported, never
+clipped: ``encode`` returns the codes and which rows are valid.
+
+Decoding uses additions, multiplications, divisions and square roots in float64 in a fixed order and
+rounds once to float32, so both ends get the same bits. No code depends on the number of threads.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from gaussians.errors import InputError
+from gaussians.parallel import run_chunks
+
+UInt16 = NDArray[np.uint16]
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+TOP = 65535  # largest 16-bit code
+FLOAT32_STEP = 2.0**-24  # largest relative rounding error of float32
+ROTATION_ERROR_RAD = 8e-5  # 2 * 2 * sqrt(3) * (sqrt(2) / 65534 / 2), and float32 rounding
+_TILE_LIMIT = 32767
+
+
+def exp2(x: Float64) -> Float64:
+    """2**x in float64 within 1e-15 relative, from exact operations only: no library decides the bits."""
+    whole = np.rint(x)
+    t = (x - whole) * 0.6931471805599453
+    value = np.ones_like(t)
+    for n in range(14, 0, -1):
+        value = 1.0 + t * value / n
+    return np.ldexp(value, whole.astype(np.int32))
+
+
+@dataclass(frozen=True)
+class LinearField:
+    """Evenly spaced codes over ``low``..``high``. Error at most ``max_error``."""
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
+            raise InputError(f"field range must rise, not go from {self.low} to {self.high}")
+
+    @property
+    def step(self) -> float:
+        return (self.high - self.low) / TOP
+
+    @property
+    def max_error(self) -> float:
+        """Half a step and the rounding to float32."""
+        return 0.5 * self.step * (1 + 1e-9) + FLOAT32_STEP * max(abs(self.low), abs(self.high))
+
+    def encode(self, values: Float32) -> tuple[UInt16, Mask]:
+        """Codes of any shape, and where the value lies in the range."""
+        wide = values.astype(np.float64)
+        valid = (wide >= self.low) & (wide <= self.high)
+        codes = np.rint((np.where(valid, wide, self.low) - self.low) / self.step)
+        return codes.astype(np.uint16), valid
+
+    def decode(self, codes: UInt16) -> Float32:
+        return (self.low + codes.astype(np.float64) * self.step).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class SquareRootField:
+    """0..``high`` with codes spaced evenly in the square root (companding): fine near 0.
+
+    Error of a value v at most sqrt(v * high) / 65535 + high / 65535**2 / 4, and float32 rounding.
+    """
+
+    high: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.high) and self.high > 0):
+            raise InputError(f"field range must end above 0, not at {self.high}")
+
+    def max_error(self, value: float) -> float:
+        """Largest error of a value in the range."""
+        rounding = (FLOAT32_STEP + 1e-12) * value
+        return math.sqrt(value * self.high) / TOP + self.high / TOP**2 / 2 + rounding
+
+    def encode(self, values: Float32) -> tuple[UInt16, Mask]:
+        wide = values.astype(np.float64)
+        valid = (wide >= 0) & (wide <= self.high)
+        codes = np.rint(np.sqrt(np.where(valid, wide, 0.0) / self.high) * TOP)
+        return codes.astype(np.uint16), valid
+
+    def decode(self, codes: UInt16) -> Float32:
+        root = codes.astype(np.float64) / TOP
+        return (root * root * self.high).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class LogField:
+    """0 exactly, and 65535 values spaced evenly in the logarithm over 2**low .. 2**high.
+
+    To the nearest: relative error at most ``max_ratio - 1``. With ``round_up`` the decoded value is never
+    below the original and at most ``max_ratio`` times it.
+    """
+
+    low: float
+    high: float
+    round_up: bool = False
+
+    def __post_init__(self) -> None:
+        if not (-150 <= self.low < self.high <= 128):
+            raise InputError(
+                f"logarithmic range must rise within -150..128, not {self.low} to {self.high}"
+            )
+
+    @classmethod
+    def covering(cls, values: Float32, *, round_up: bool = False) -> LogField:
+        """The range of the positive ones of these values, its ends widened to multiples of 1/64."""
+        positive = values[values > 0].astype(np.float64)
+        if not len(positive):
+            return cls(-1.0, 1.0, round_up)
+        low, high = np.log2(positive.min()), np.log2(positive.max())
+        return cls(
+            float(np.floor(low * 64 - 0.01) / 64), float(np.ceil(high * 64 + 0.01) / 64), round_up
+        )
+
+    @property
+    def step(self) -> float:
+        """Step of the base-2 logarithm."""
+        return (self.high - self.low) / (TOP - 1)
+
+    @property
+    def max_ratio(self) -> float:
+        """Largest factor between a value and its decoded one."""
+        return 2.0 ** (self.step * (1.0 if self.round_up else 0.5)) * (1 + 4 * FLOAT32_STEP)
+
+    @cached_property
+    def _table(self) -> Float32:
+        """[65536] decoded values."""
+        values = exp2(self.low + np.arange(-1, TOP) * self.step)
+        values[0] = 0.0
+        return values.astype(np.float32)
+
+    @cached_property
+    def _limits(self) -> Float64:
+        """[65537] code n stands for values in limits[n] .. limits[n + 1]; nearest only."""
+        inner = exp2(self.low + (np.arange(-1, TOP + 1) - 0.5) * self.step)
+        inner[0] = 0.0
+        return inner
+
+    def encode(self, values: Float32) -> tuple[UInt16, Mask]:
+        wide = values.astype(np.float64)
+        floor = 2.0 ** (self.low - self.step)
+        valid = (wide == 0) | ((wide >= floor) & (wide <= np.float64(self._table[-1])))
+        inside = np.where(valid & (wide > 0), wide, 1.0 if self.low <= 0 <= self.high else floor)
+        guess = (np.log2(inside) - self.low) / self.step + 1
+        if self.round_up:
+            codes = np.clip(np.ceil(guess), 1, TOP).astype(np.int32)
+            codes -= (codes > 1) & (self._table[codes - 1] >= inside)
+            codes += (codes < TOP) & (self._table[codes] < inside)
+        else:
+            codes = np.clip(np.rint(guess), 1, TOP).astype(np.int32)
+            codes -= (codes > 1) & (inside < self._limits[codes])
+            codes += (codes < TOP) & (inside >= self._limits[codes + 1])
+        return np.where(wide > 0, codes, 0).astype(np.uint16), valid
+
+    def decode(self, codes: UInt16) -> Float32:
+        return self._table[codes]
+
+
+@dataclass(frozen=True)
+class PositionField:
+    """Positions as the number of a cubic tile (three signed 16-bit) and a 16-bit offset per axis in it.
+
+    The tile's edge is a power of two, so tiles and steps are exact. Error per axis at most
+    ``max_error(|coordinate|)``: half a step (edge / 65536) and the rounding to float32.
+    """
+
+    tile_m: float
+
+    def __post_init__(self) -> None:
+        if not (self.tile_m > 0 and math.frexp(self.tile_m)[0] == 0.5):
+            raise InputError(f"tile edge must be a power of two in metres, not {self.tile_m}")
+
+    @property
+    def step(self) -> float:
+        return self.tile_m / (TOP + 1)
+
+    def max_error(self, coordinate: float) -> float:
+        return 0.5 * self.step + FLOAT32_STEP * (abs(coordinate) + self.step)
+
+    def encode(self, means: Float32) -> tuple[NDArray[np.int16], UInt16, Mask]:
+        """Tiles and offsets [N, 3], and per row whether all three tiles fit."""
+        scaled = means.astype(np.float64) / self.tile_m
+        tile = np.floor(scaled)
+        valid = (np.abs(tile) <= _TILE_LIMIT).all(axis=1)
+        tile = np.where(valid[:, None], tile, 0.0)
+        offset = np.floor((np.where(valid[:, None], scaled, 0.0) - tile) * (TOP + 1))
+        return tile.astype(np.int16), offset.astype(np.uint16), valid
+
+    def decode(self, tile: NDArray[np.int16], offset: UInt16) -> Float32:
+        inside = (offset.astype(np.float64) + 0.5) * self.step
+        return (tile.astype(np.float64) * self.tile_m + inside).astype(np.float32)
+
+
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+_ROTATION_STEP = math.sqrt(2.0) / (TOP - 1)  # an even number of steps: zero is a code
+
+
+def encode_rotation(quaternions: Float32) -> tuple[NDArray[np.uint8], UInt16]:
+    """Smallest three: which component is largest [N], and the other three [N, 3] over +-1/sqrt(2).
+
+    The quaternion is normalised first. The decoded rotation differs by at most ``ROTATION_ERROR_RAD``.
+    """
+    wide = quaternions.astype(np.float64)
+    wide /= np.sqrt((wide * wide).sum(axis=1, keepdims=True))
+    largest = np.abs(wide).argmax(axis=1)
+    rows = np.arange(len(wide))
+    sign = np.where(wide[rows, largest] < 0, -1.0, 1.0)
+    three = wide[rows[:, None], _OTHERS[largest]] * sign[:, None]
+    codes = np.rint(three / _ROTATION_STEP) + (TOP - 1) // 2
+    return largest.astype(np.uint8), np.clip(codes, 0, TOP - 1).astype(np.uint16)
+
+
+def decode_rotation(largest: NDArray[np.uint8], codes: UInt16) -> Float32:
+    """[N, 4] unit quaternions; the omitted component is positive."""
+    three = (codes.astype(np.float64) - (TOP - 1) // 2) * _ROTATION_STEP
+    rest = np.maximum(1.0 - (three * three).sum(axis=1), 0.0)
+    quaternions = np.empty((len(three), 4), np.float64)
+    rows = np.arange(len(three))
+    quaternions[rows, largest] = np.sqrt(rest)
+    quaternions[rows[:, None], _OTHERS[largest]] = three
+    return quaternions.astype(np.float32)
+
+
+AC_RANGE = 8.0  # coefficients beyond this are not coded by a codebook
+AC_ERROR = 0.5  # nor is a Gaussian of which one coefficient would be off by more than this
+_GRID = 2.0**14  # words and vectors are compared on multiples of 1 / _GRID
+_BATCH = 4096
+_BLOCK = 1 << 19  # distances held at a time
+
+
+@dataclass(frozen=True)
+class Codebook:
+    """Vector quantiser of the spherical-harmonic coefficients above degree 0, in residual stages.
+
+    Stage s codes what the stages before it left over. Words are float16 multiples of 2^-14 within +-16,
+    vectors are rounded to multiples of 2^-14 before they are compared with them: squared distances are
+    then exact in float64 whatever the order of summation, so neither training nor ``encode`` depends on
+    the linear-algebra library, its threads, or the machine.
+    """
+
+    stages: tuple[NDArray[np.float16], ...]  # each [words, dimensions]
+
+    @classmethod
+    def train(cls, vectors: Float32, *, words: int, stages: int, seed: int) -> Codebook:
+        """Mini-batch k-means, one pass in random order over ``vectors`` [N, dimensions] per stage.
+
+        At most N / 8 words, duplicates removed. Vectors with a coefficient beyond ``AC_RANGE`` are left
+        out. Raises InputError unless words and stages are positive and any vector is left.
+        """
+        if words < 1 or words > TOP + 1 or stages < 1:
+            raise InputError(f"codebook needs 1..65536 words and >= 1 stages, not {words}, {stages}")
+        rest = _on_grid(vectors[(np.abs(vectors) <= AC_RANGE).all(axis=1)])
+        if not len(rest):
+            raise InputError(f"codebook needs a vector with all coefficients within {AC_RANGE:g}")
+        books = []
+        for stage in range(stages):
+            count = max(1, min(words, len(rest) // 8))
+            book = _train_stage(rest, count, np.random.default_rng([seed, stage]))
+            rest = rest - book[_nearest(rest, book)]
+            books.append(book)
+        return cls(tuple(books))
+
+    @property
+    def dimensions(self) -> int:
+        """Coefficients per vector."""
+        return self.stages[0].shape[1]
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of all words."""
+        return sum(book.nbytes for book in self.stages)
+
+    def encode(self, vectors: Float32) -> tuple[UInt16, Mask]:
+        """Nearest words [N, stages], and per row whether no coefficient is off by more than ``AC_ERROR``."""
+        valid = (np.abs(vectors) <= AC_RANGE).all(axis=1)
+        rest = _on_grid(np.where(valid[:, None], vectors, 0.0))
+        codes = np.empty((len(vectors), len(self.stages)), np.uint16)
+        for stage, book in enumerate(self.stages):
+            codes[:, stage] = _nearest(rest, book)
+            rest -= book[codes[:, stage]]
+        errors = np.abs(self.decode(codes).astype(np.float64) - vectors)
+        return codes, valid & (errors <= AC_ERROR).all(axis=1)
+
+    def decode(self, codes: UInt16) -> Float32:
+        """Sums of words [N, dimensions]; exact in float32."""
+        total = self.stages[0][codes[:, 0]].astype(np.float32)
+        for stage, book in enumerate(self.stages[1:], start=1):
+            total += book[codes[:, stage]]
+        return total
+
+
+def _on_grid(vectors: NDArray[np.floating]) -> Float64:
+    return np.rint(np.asarray(vectors, np.float64) * _GRID) / _GRID
+
+
+def _train_stage(vectors: Float64, words: int, rng: np.random.Generator) -> NDArray[np.float16]:
+    """Words of one stage: scikit-learn's mini-batch steps, rounded to the grid after each."""
+    from sklearn.cluster import MiniBatchKMeans
+
+    order = rng.permutation(len(vectors))
+    start = vectors[order[:words]]
+    means = MiniBatchKMeans(
+        words, init=start, n_init=1, compute_labels=False, random_state=int(rng.integers(2**31))
+    )
+    batch = max(_BATCH, words)
+    with threadpool_limits(1):  # several threads wait for each other longer than they work
+        for begin in range(0, len(order), batch):
+            rows = order[begin : begin + batch]
+            if len(rows) < words:
+                break
+            means.partial_fit(vectors[rows])
+            means.cluster_centers_[:] = _on_grid(means.cluster_centers_)
+    return np.unique(means.cluster_centers_.astype(np.float16), axis=0)
+
+
+def _nearest(vectors: Float64, book: NDArray[np.float16]) -> NDArray[np.int64]:
+    """[N] index of the nearest word; the lower one of two at the same distance."""
+    best = np.empty(len(vectors), np.int64)
+    with threadpool_limits(1):
+        run_chunks(_nearest_range, len(vectors), vectors, book.astype(np.float64), best)
+    return best
+
+
+def _nearest_range(begin: int, end: int, vectors: Float64, book: Float64, best: Any) -> None:
+    """Distances in float32 first; rows whose two best differ by less than the rounding bound of a dot
+    product in any order are decided by exact distances in float64."""
+    norms = (book * book).sum(axis=1)
+    narrow = np.vstack([-2 * book.T, norms]).astype(np.float32)
+    longest = math.sqrt(norms.max())
+    block = max(1, _BLOCK // len(book))
+    for low in range(begin, end, block):
+        rows = vectors[low : min(low + block, end)]
+        lengths = np.sqrt((rows * rows).sum(axis=1))
+        bounds = (book.shape[1] + 4) * FLOAT32_STEP * (2 * lengths * longest + longest**2)
+        ones = np.ones((len(rows), 1), np.float32)
+        distances = np.hstack([rows.astype(np.float32), ones]) @ narrow
+        numbers = np.arange(len(rows))
+        first = distances.argmin(axis=1)
+        least = distances[numbers, first].astype(np.float64)
+        distances[numbers, first] = np.inf
+        close = np.flatnonzero(distances.min(axis=1) - least <= 2 * bounds)
+        if len(close):
+            first[close] = (norms - 2 * (rows[close] @ book.T)).argmin(axis=1)
+        best[low : low + len(rows)] = first
+
+
+def record_bytes(sh_degree: int, stages: int) -> float:
+    """Bytes of one coded Gaussian before entropy coding, without tile, ids and node sphere.
+
+    Position, scales and DC colour 3 x 2, rotation 3 x 2 and 2 bits, opacity 2, 2 per codebook stage.
+    """
+    return 26.25 + (2.0 * stages if sh_degree else 0.0)

@@ -1,0 +1,141 @@
+"""Footprints: the image-space shapes by which a splat is binned, and their cuts with a tile row.
+
+``ellipse``: the opacity-aware contour p = threshold, widened by the rounding bound of
+conventions.md. ``square_3sigma``: INRIA's square of radius ceil(3 sigma_max). ``obb``: GSCore's
+oriented box of three sigmas. The last two drop contributions that the ellipse keeps: an opacity of
+1 reaches 1/255 only at 3.33 sigma. Arithmetic is float64 on the float32 conic and covariance.
+
+A footprint is prepared once per splat and eye into a shape record, whose columns depend on the
+rule. Called from kernels in other files; see kernel_cache.py.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, get_args
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from gaussians.constants import CONIC_A, CONIC_B, CONIC_C, THRESHOLD
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Intersection = Literal["ellipse", "square_3sigma", "obb"]
+INTERSECTIONS: tuple[str, ...] = get_args(Intersection)
+ELLIPSE, SQUARE, BOX = range(3)
+
+SHAPE_COLUMNS = 6
+_SLOPE, _INVERSE, _REACH, _DET, _TOP, _WIDEST = range(6)  # ellipse
+_RADIUS = 0  # square
+_X1, _Y1, _X2, _Y2 = range(4)  # box: half axes (x1, y1) and (x2, y2)
+
+_ROUNDING = 16.0 * 2.0**-24  # bound on p's float32 rounding, relative, see conventions.md
+_SIGMAS = 3.0  # INRIA and GSCore: splats are cut at three standard deviations
+_FAR_PX = 1e9
+_EMPTY = (1.0, -1.0)
+
+
+@njit(cache=True, error_model="numpy")
+def _prepare_ellipse(feature: Float32, shape: Float64) -> float:
+    """With a, c widened by the rounding bound and q = -threshold, the boundary over dy is
+    (-b dy -+ sqrt(2 q a - det dy^2)) / a; it is widest to the right at dy = WIDEST."""
+    a = np.float64(feature[CONIC_A]) * (1.0 - _ROUNDING)
+    b = np.float64(feature[CONIC_B])
+    c = np.float64(feature[CONIC_C]) * (1.0 - _ROUNDING)
+    two_q = -2.0 * np.float64(feature[THRESHOLD])
+    det = a * c - b * b
+    shape[_SLOPE], shape[_INVERSE] = -b / a, 1.0 / a
+    shape[_REACH], shape[_DET] = two_q * a, det
+    if two_q < 0.0:
+        shape[_TOP] = -1.0
+    elif det > 0.0:
+        shape[_TOP] = math.sqrt(two_q * a / det)
+        shape[_WIDEST] = -b * math.sqrt(two_q / (c * det))
+    else:
+        shape[_TOP] = np.inf
+    return shape[_TOP]
+
+
+@njit(cache=True, error_model="numpy")
+def prepare_footprint(rule: int, feature: Float32, covariance: Float32, shape: Float64) -> float:
+    """Fill the shape record; its half height in px: negative if empty, infinite if unbounded.
+
+    An ellipse is unbounded where rounding leaves it so (condition number about 1e6 and above).
+    """
+    if rule == ELLIPSE:
+        return _prepare_ellipse(feature, shape)
+    cxx, cxy = np.float64(covariance[0]), np.float64(covariance[1])
+    cyy = np.float64(covariance[2])
+    middle = 0.5 * (cxx + cyy)
+    square_root_of = middle * middle - (cxx * cyy - cxy * cxy)
+    if rule == SQUARE:  # INRIA's floor of 0.1 under the root
+        largest = middle + math.sqrt(max(0.1, square_root_of))
+        shape[_RADIUS] = np.ceil(_SIGMAS * math.sqrt(largest))
+        return shape[_RADIUS]
+    spread = math.sqrt(max(0.0, square_root_of))
+    angle = 0.5 * math.atan2(2.0 * cxy, cxx - cyy)
+    long_axis = _SIGMAS * math.sqrt(middle + spread)
+    short_axis = _SIGMAS * math.sqrt(max(0.0, middle - spread))
+    cosine, sine = math.cos(angle), math.sin(angle)
+    shape[_X1], shape[_Y1] = long_axis * cosine, long_axis * sine
+    shape[_X2], shape[_Y2] = -short_axis * sine, short_axis * cosine
+    return abs(shape[_Y1]) + abs(shape[_Y2])
+
+
+@njit(cache=True, error_model="numpy")
+def _ellipse_interval(shape: Float64, low: float, high: float) -> tuple[float, float]:
+    top = shape[_TOP]
+    low, high = max(low, -top), min(high, top)
+    if low > high:
+        return _EMPTY
+    slope, inverse, reach, det = shape[_SLOPE], shape[_INVERSE], shape[_REACH], shape[_DET]
+    if top < np.inf:
+        right_dy = min(max(shape[_WIDEST], low), high)
+        left_dy = min(max(-shape[_WIDEST], low), high)
+        root_r = math.sqrt(max(0.0, reach - det * right_dy * right_dy))
+        root_l = math.sqrt(max(0.0, reach - det * left_dy * left_dy))
+        return slope * left_dy - root_l * inverse, slope * right_dy + root_r * inverse
+    root_low = math.sqrt(reach - det * low * low) * inverse
+    root_high = math.sqrt(reach - det * high * high) * inverse
+    left = min(slope * low - root_low, slope * high - root_high)
+    right = max(slope * low + root_low, slope * high + root_high)
+    return left, right
+
+
+@njit(cache=True, error_model="numpy")
+def _box_interval(shape: Float64, low: float, high: float) -> tuple[float, float]:
+    """Corners inside the slab, and edges cut by its two lines."""
+    x1, y1, x2, y2 = shape[_X1], shape[_Y1], shape[_X2], shape[_Y2]
+    left, right = _FAR_PX, -_FAR_PX
+    for corner in range(4):
+        p = 1.0 if corner < 2 else -1.0
+        q = 1.0 if corner == 0 or corner == 3 else -1.0
+        xa, ya = p * x1 + q * x2, p * y1 + q * y2
+        if low <= ya <= high:
+            left, right = min(left, xa), max(right, xa)
+        for edge in range(2):  # to the corner where q changes sign, and to the one where p does
+            turn = -1.0 if edge == 1 else 1.0
+            xb, yb = turn * (p * x1 - q * x2), turn * (p * y1 - q * y2)
+            for side in range(2):
+                y = low if side == 0 else high
+                if (ya - y) * (yb - y) < 0.0:
+                    x = xa + (xb - xa) * (y - ya) / (yb - ya)
+                    left, right = min(left, x), max(right, x)
+    return left, right
+
+
+@njit(cache=True, error_model="numpy")
+def footprint_interval(rule: int, shape: Float64, low: float, high: float) -> tuple[float, float]:
+    """x interval, relative to the centre, of the footprint over dy in [low, high].
+
+    Empty: left > right.
+    """
+    if rule == ELLIPSE:
+        return _ellipse_interval(shape, low, high)
+    if rule == BOX:
+        return _box_interval(shape, low, high)
+    if low >= shape[_RADIUS] or high <= -shape[_RADIUS]:
+        return _EMPTY
+    return -shape[_RADIUS], shape[_RADIUS]
