@@ -51,7 +51,5 @@ def _lossless_size(data: bytes, name: str) -> tuple[int, int]:
         if kind == b"VP8L" and len(body) == 5 and body[0] == _LOSSLESS_SIGNATURE:
             bits = int.from_bytes(body[1:], "little")
             return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
-        if kind in (b"VP8 ", b"ALPH", b"ANIM"):
-            break
         position += 8 + size + size % 2
     raise InputError(f"{name}: must be a still, lossless WebP image")

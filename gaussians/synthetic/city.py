@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +29,7 @@ from gaussians.synthetic.splats import (
 
 Float64 = NDArray[np.float64]
 Ids = NDArray[np.int64]
+Opacity = Callable[[np.random.Generator, int], Float64]
 
 EYE_HEIGHT_M = 1.6
 MIN_LEAVES, MAX_LEAVES = 1_000, 20_000_000
@@ -115,16 +117,25 @@ class _Sampler:
         leafy = self.crowns.exposures * _leaf_area(self.crowns) / (distance * distance)
         self.weights = np.concatenate([weights, leafy])
 
-    def sample(self, rng, count, opacity, shape):  # type: ignore[no-untyped-def]
+    def sample(
+        self, rng: np.random.Generator, count: int, opacity: Opacity, shape: Shape
+    ) -> tuple[Chunk, Chunk]:
         """Chunks with ``count`` splats in all, spread over rectangles and crowns by weight."""
         counts = systematic_counts(self.weights, count, rng.random())
         shares = self.weights * (count / self.weights.sum())
         spread = np.minimum(shape.reach * np.sqrt(self.areas / shares), self.most)
         cut = len(self.ids)
-        yield self._on_cells(rng, counts[:cut], spread[:cut], opacity, shape)
-        yield self._in_crowns(rng, counts[cut:], spread[cut:], opacity, shape)
+        surface = self._on_cells(rng, counts[:cut], spread[:cut], opacity, shape)
+        return surface, self._in_crowns(rng, counts[cut:], spread[cut:], opacity)
 
-    def _on_cells(self, rng, counts, spread, opacity, shape):  # type: ignore[no-untyped-def]
+    def _on_cells(
+        self,
+        rng: np.random.Generator,
+        counts: Ids,
+        spread: Float64,
+        opacity: Opacity,
+        shape: Shape,
+    ) -> Chunk:
         cell = np.repeat(np.arange(len(counts)), counts)
         index = np.arange(len(cell)) - np.repeat(np.cumsum(counts) - counts, counts)
         first = rng.random((len(counts), 2))
@@ -138,12 +149,14 @@ class _Sampler:
             rng, self.patches, ids, (place[0], place[1]), spread[cell], opacities, shape
         )
 
-    def _in_crowns(self, rng, counts, spread, opacity, shape):  # type: ignore[no-untyped-def]
+    def _in_crowns(
+        self, rng: np.random.Generator, counts: Ids, spread: Float64, opacity: Opacity
+    ) -> Chunk:
         ids = np.repeat(np.arange(len(counts)), counts)
         inside = near_normal(rng, (len(ids), 3)).astype(np.float64)
         x, y, z = inside.T
         deep = rng.random(len(ids))
-        radius = (1.0 - 0.5 * deep * deep)
+        radius = 1.0 - 0.5 * deep * deep
         inside *= (radius / np.sqrt(x * x + y * y + z * z + 1e-12))[:, None]
         return leaf_splats(rng, self.crowns, ids, inside, spread[ids], opacity(rng, len(ids)))
 

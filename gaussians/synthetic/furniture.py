@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from gaussians.synthetic.patches import Colour, GeometryBuilder, Material
 
 _BARK: Colour = (0.30, 0.22, 0.16)
@@ -18,6 +20,7 @@ _CAR_TINTS: tuple[Colour, ...] = (
 )
 _CROSSING = (6.0, 22.0)  # kept free of trees, cars and lamps along the main street
 _PAVEMENT_Z = 0.13
+Placer = Callable[[GeometryBuilder, float, float], None]
 
 
 def add_furniture(builder: GeometryBuilder) -> None:
@@ -37,7 +40,9 @@ def add_furniture(builder: GeometryBuilder) -> None:
         tree(builder, x, y, 0.0, float(rng.uniform(1.6, 2.6)), 0.3)
 
 
-def _along(builder, side, *, first, step, place):  # type: ignore[no-untyped-def]
+def _along(
+    builder: GeometryBuilder, side: float, *, first: float, step: float, place: Placer
+) -> None:
     """Call ``place(builder, x, side)`` about every ``step`` metres, sparing the crossing."""
     x = first
     while x < 77.0:
@@ -110,7 +115,9 @@ def _clutter(builder: GeometryBuilder, x: float, side: float) -> None:
         builder.box((x, y), _PAVEMENT_Z + 0.95, (0.52, 0.52, 0.08), Material.PLAIN, _METAL)
     elif kind == 2:
         for dx in (-0.7, 0.7):
-            builder.box((x + dx, side * 6.6), _PAVEMENT_Z, (0.08, 0.4, 0.42), Material.PLAIN, _METAL)
+            builder.box(
+                (x + dx, side * 6.6), _PAVEMENT_Z, (0.08, 0.4, 0.42), Material.PLAIN, _METAL
+            )
         wood = (0.48, 0.30, 0.16)
         builder.box((x, side * 6.6), _PAVEMENT_Z + 0.42, (1.8, 0.45, 0.06), Material.BARK, wood)
         builder.box((x, side * 6.82), _PAVEMENT_Z + 0.48, (1.8, 0.06, 0.42), Material.BARK, wood)
@@ -121,4 +128,6 @@ def _clutter(builder: GeometryBuilder, x: float, side: float) -> None:
     else:
         card = (0.62, 0.46, 0.28)
         builder.box((x, side * 6.8), _PAVEMENT_Z, (0.8, 0.6, 0.55), Material.PLAIN, card)
-        builder.box((x + 0.1, side * 6.85), _PAVEMENT_Z + 0.55, (0.5, 0.4, 0.4), Material.PLAIN, card)
+        builder.box(
+            (x + 0.1, side * 6.85), _PAVEMENT_Z + 0.55, (0.5, 0.4, 0.4), Material.PLAIN, card
+        )

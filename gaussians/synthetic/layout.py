@@ -93,7 +93,12 @@ def _cross_street(builder: GeometryBuilder) -> None:
             for x, direction in ((c0, 1.0), (c1, -1.0)):  # kerbs face the carriageway
                 start, edge = (low, high - low) if direction > 0 else (high, low - high)
                 builder.rectangle(
-                    (x, start, 0.0), (0.0, edge, 0.0), (0.0, 0.0, KERB_M), Material.PLAIN, _KERB, 0.4
+                    (x, start, 0.0),
+                    (0.0, edge, 0.0),
+                    (0.0, 0.0, KERB_M),
+                    Material.PLAIN,
+                    _KERB,
+                    0.4,
                 )
         for inner, outer in ((STREET_HALF_M, PARALLEL_STREET_Y[0]), (PARALLEL_STREET_Y[1], 80.0)):
             low, high = sorted((side * inner, side * outer))

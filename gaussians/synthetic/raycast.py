@@ -47,7 +47,9 @@ class RayGrid:
         return rays
 
 
-def cast(geometry: Geometry, pose: Pose, grid: RayGrid, near_m: float) -> tuple[Float64, NDArray]:
+def cast(
+    geometry: Geometry, pose: Pose, grid: RayGrid, near_m: float
+) -> tuple[Float64, NDArray[np.int32]]:
     """Depths [ny, nx, LAYERS] in metres, nearest first, and what was hit [ny, nx, LAYERS] int32.
 
     A hit is the index of a rectangle, or the number of rectangles plus the index of a crown; -1 (depth
@@ -80,7 +82,7 @@ def to_camera(points: Float64, pose: Pose) -> Float64:
 
 
 @njit(cache=True, error_model="numpy")
-def _insert(depths, hits, j, i, z, what):  # type: ignore[no-untyped-def]
+def _insert(depths: Float64, hits: NDArray[np.int32], j: int, i: int, z: float, what: int) -> None:
     k = depths.shape[2] - 1
     if not z < depths[j, i, k]:
         return
@@ -93,7 +95,14 @@ def _insert(depths, hits, j, i, z, what):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _cells(low_x, high_x, low_y, high_y, window, shape):  # type: ignore[no-untyped-def]
+def _cells(
+    low_x: float,
+    high_x: float,
+    low_y: float,
+    high_y: float,
+    window: Float64,
+    shape: tuple[int, int, int],
+) -> tuple[int, int, int, int]:
     """First and last column and row of the ray cells that a box of tangents covers."""
     step = window[2]
     i0 = max(np.floor((low_x - window[0]) / step), 0.0)
@@ -104,7 +113,15 @@ def _cells(low_x, high_x, low_y, high_y, window, shape):  # type: ignore[no-unty
 
 
 @njit(cache=True, error_model="numpy")
-def _cast_rectangles(origins, along_u, along_v, rays, window, depths, hits):  # type: ignore[no-untyped-def]
+def _cast_rectangles(
+    origins: Float64,
+    along_u: Float64,
+    along_v: Float64,
+    rays: Float64,
+    window: Float64,
+    depths: Float64,
+    hits: NDArray[np.int32],
+) -> None:
     near = window[3]
     corners = np.empty((4, 3))
     for g in range(len(origins)):
@@ -151,7 +168,16 @@ def _cast_rectangles(origins, along_u, along_v, rays, window, depths, hits):  # 
 
 
 @njit(cache=True, error_model="numpy")
-def _cast_crowns(centres, radii, rotation, first, rays, window, depths, hits):  # type: ignore[no-untyped-def]
+def _cast_crowns(
+    centres: Float64,
+    radii: Float64,
+    rotation: Float64,
+    first: int,
+    rays: Float64,
+    window: Float64,
+    depths: Float64,
+    hits: NDArray[np.int32],
+) -> None:
     near = window[3]
     for g in range(len(centres)):
         c, radius = centres[g], radii[g].max()

@@ -141,7 +141,9 @@ def assemble(rng: np.random.Generator, chunks: list[Chunk], sh_degree: int) -> S
         for field in ("means", "quaternions", "scales", "opacities", "colours")
     ]
     lobes = np.concatenate([c.lobes for c in chunks])[order]
-    return Scene(*plain[:4], _harmonics(rng, plain[4], lobes, sh_degree)).validate("synthetic scene")
+    return Scene(*plain[:4], _harmonics(rng, plain[4], lobes, sh_degree)).validate(
+        "synthetic scene"
+    )
 
 
 def _harmonics(

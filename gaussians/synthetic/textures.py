@@ -215,7 +215,7 @@ def _shop(
     sign = ground & shop & (p.v > 2.95) & (p.v < 3.55)
     band = hash_unit(p.seed, np.full(len(x), 1), np.full(len(x), 5))
     base = np.stack([0.15 + 0.5 * band, 0.14 + 0.25 * (1 - band), 0.16 + 0.3 * (1 - band)], axis=1)
-    letters = (hash_unit(p.seed, np.floor(p.u / 0.16).astype(int), np.floor(p.v / 0.2).astype(int)))
+    letters = hash_unit(p.seed, np.floor(p.u / 0.16).astype(int), np.floor(p.v / 0.2).astype(int))
     written = sign & (letters > 0.5) & (np.abs(p.v - 3.25) < 0.2) & (away < 0.36 * bay)
     _paint(colours, sign, base[sign])
     _paint(colours, written, (0.92, 0.88, 0.72))
@@ -246,7 +246,9 @@ def leaf_colours(
     """
     x, y, z = inside.T
     depth = np.sqrt(x * x + y * y + z * z)
-    tuft = value_noise(seeds, positions[:, 0] / 0.35 + positions[:, 2] / 0.5, positions[:, 1] / 0.35)
+    tuft = value_noise(
+        seeds, positions[:, 0] / 0.35 + positions[:, 2] / 0.5, positions[:, 1] / 0.35
+    )
     light = 0.30 + 0.55 * depth * (0.6 + 0.25 * z - 0.12 * x - 0.1 * y) + 0.75 * (tuft - 0.35)
     yellow = (0.25 * tuft)[:, None] * np.array([0.45, 0.35, 0.0])
     return np.clip((tints * 1.15 + yellow) * np.clip(light, 0.12, 1.25)[:, None], 0.0, 1.0)

@@ -83,7 +83,9 @@ class BenchmarkView:
                 f"view needs {LAYERS} layer_shares, and a floater_share, in 0..1, not {shares}"
             )
         if self.display not in DISPLAYS:
-            raise InputError(f"view display must be one of {', '.join(DISPLAYS)}, not {self.display}")
+            raise InputError(
+                f"view display must be one of {', '.join(DISPLAYS)}, not {self.display}"
+            )
 
     @classmethod
     def from_mapping(cls, mapping: dict[str, object]) -> BenchmarkView:
@@ -109,7 +111,10 @@ def benchmark_scene(view: BenchmarkView) -> tuple[Scene, StereoRig]:
     pose = look_at(np.array(view.eye_m) - below, np.array(view.target_m) - below, _UP)
     rig = StereoRig(DISPLAYS[view.display], pose, near_m=view.near_m)
     d = rig.display
-    half_width, half_height = view.window * 0.5 * d.width / d.fx, view.window * 0.5 * d.height / d.fy
+    half_width, half_height = (
+        view.window * 0.5 * d.width / d.fx,
+        view.window * 0.5 * d.height / d.fy,
+    )
     grid = RayGrid.over(rng, half_width, half_height, view.spacing_px / d.fx)
     geometry = _geometry(rng, view).moved(-below)
     hits = _hits(rng, geometry, pose, grid, view)
@@ -207,9 +212,10 @@ def _floaters(
     """Faint blobs before the eye, as many in each octave of depth, none below the ground."""
     octave = _FLOATER_OCTAVES * rng.random(count)
     whole = np.floor(octave)
-    depth = _FLOATER_NEAREST_M * np.array([2.0**k for k in range(_FLOATER_OCTAVES)])[
-        whole.astype(np.int64)
-    ]
+    depth = (
+        _FLOATER_NEAREST_M
+        * np.array([2.0**k for k in range(_FLOATER_OCTAVES)])[whole.astype(np.int64)]
+    )
     depth *= 1.0 + (octave - whole)
     rays = np.ones((count, 3))
     rays[:, :2] = (2.0 * rng.random((count, 2)) - 1.0) * np.array(window)
