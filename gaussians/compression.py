@@ -1,9 +1,9 @@
-"""Number formats of the Gaussian stream: 16-bit fixed point per field, a codebook for the harmonics.
+"""Number formats of the Gaussian stream: 16-bit fixed point per field, a harmonics codebook.
 
 The paper's coding (Sec. 4.3): attributes are coded independently of each other; every attribute is
-16-bit fixed point but the spherical harmonics above degree 0 ("AC"), which are vector-quantised. Where
-the paper names no range, the range comes from the scene, and a value outside it is reported, never
-clipped: ``encode`` returns the codes and which rows are valid.
+16-bit fixed point but the spherical harmonics above degree 0 ("AC"), which are vector-quantised.
+Where the paper names no range, the range comes from the scene, and a value outside it is reported,
+never clipped: ``encode`` returns the codes and which values are valid.
 
 Decoding uses additions, multiplications, divisions and square roots in float64 in a fixed order and
 rounds once to float32, so both ends get the same bits. No code depends on the number of threads.
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
+from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # has no stubs
 
 from gaussians.errors import InputError
 from gaussians.parallel import run_chunks
@@ -35,7 +35,9 @@ _TILE_LIMIT = 32767
 
 
 def exp2(x: Float64) -> Float64:
-    """2**x in float64 within 1e-15 relative, from exact operations only: no library decides the bits."""
+    """2**x in float64 within 1e-15 relative, from exact operations only: no library decides the
+    bits.
+    """
     whole = np.rint(x)
     t = (x - whole) * 0.6931471805599453
     value = np.ones_like(t)
@@ -108,8 +110,8 @@ class SquareRootField:
 class LogField:
     """0 exactly, and 65535 values spaced evenly in the logarithm over 2**low .. 2**high.
 
-    To the nearest: relative error at most ``max_ratio - 1``. With ``round_up`` the decoded value is never
-    below the original and at most ``max_ratio`` times it.
+    To the nearest: relative error at most ``max_ratio - 1``. With ``round_up`` the decoded value
+    is never below the original and at most ``max_ratio`` times it.
     """
 
     low: float
@@ -146,14 +148,14 @@ class LogField:
     @cached_property
     def _table(self) -> Float32:
         """[65536] decoded values."""
-        values = exp2(self.low + np.arange(-1, TOP) * self.step)
+        values = exp2(self.low + np.arange(-1, TOP, dtype=np.float64) * self.step)
         values[0] = 0.0
         return values.astype(np.float32)
 
     @cached_property
     def _limits(self) -> Float64:
         """[65537] code n stands for values in limits[n] .. limits[n + 1]; nearest only."""
-        inner = exp2(self.low + (np.arange(-1, TOP + 1) - 0.5) * self.step)
+        inner = exp2(self.low + (np.arange(-1, TOP + 1, dtype=np.float64) - 0.5) * self.step)
         inner[0] = 0.0
         return inner
 
@@ -179,7 +181,7 @@ class LogField:
 
 @dataclass(frozen=True)
 class PositionField:
-    """Positions as the number of a cubic tile (three signed 16-bit) and a 16-bit offset per axis in it.
+    """Positions as the number of a cubic tile (three signed 16-bit) and 16-bit offsets in it.
 
     The tile's edge is a power of two, so tiles and steps are exact. Error per axis at most
     ``max_error(|coordinate|)``: half a step (edge / 65536) and the rounding to float32.
@@ -202,7 +204,7 @@ class PositionField:
         """Tiles and offsets [N, 3], and per row whether all three tiles fit."""
         scaled = means.astype(np.float64) / self.tile_m
         tile = np.floor(scaled)
-        valid = (np.abs(tile) <= _TILE_LIMIT).all(axis=1)
+        valid: Mask = np.all(np.abs(tile) <= _TILE_LIMIT, axis=1)
         tile = np.where(valid[:, None], tile, 0.0)
         offset = np.floor((np.where(valid[:, None], scaled, 0.0) - tile) * (TOP + 1))
         return tile.astype(np.int16), offset.astype(np.uint16), valid
@@ -219,7 +221,8 @@ _ROTATION_STEP = math.sqrt(2.0) / (TOP - 1)  # an even number of steps: zero is 
 def encode_rotation(quaternions: Float32) -> tuple[NDArray[np.uint8], UInt16]:
     """Smallest three: which component is largest [N], and the other three [N, 3] over +-1/sqrt(2).
 
-    The quaternion is normalised first. The decoded rotation differs by at most ``ROTATION_ERROR_RAD``.
+    The quaternion is normalised first. The decoded rotation differs by at most
+    ``ROTATION_ERROR_RAD``.
     """
     wide = quaternions.astype(np.float64)
     wide /= np.sqrt((wide * wide).sum(axis=1, keepdims=True))
@@ -243,7 +246,7 @@ def decode_rotation(largest: NDArray[np.uint8], codes: UInt16) -> Float32:
 
 
 AC_RANGE = 8.0  # coefficients beyond this are not coded by a codebook
-AC_ERROR = 0.5  # nor is a Gaussian of which one coefficient would be off by more than this
+AC_ERROR = 1.0  # nor is a Gaussian of which one coefficient would be off by more than this
 _GRID = 2.0**14  # words and vectors are compared on multiples of 1 / _GRID
 _BATCH = 4096
 _BLOCK = 1 << 19  # distances held at a time
@@ -253,10 +256,10 @@ _BLOCK = 1 << 19  # distances held at a time
 class Codebook:
     """Vector quantiser of the spherical-harmonic coefficients above degree 0, in residual stages.
 
-    Stage s codes what the stages before it left over. Words are float16 multiples of 2^-14 within +-16,
-    vectors are rounded to multiples of 2^-14 before they are compared with them: squared distances are
-    then exact in float64 whatever the order of summation, so neither training nor ``encode`` depends on
-    the linear-algebra library, its threads, or the machine.
+    Stage s codes what the stages before it left over. Words are float16 multiples of 2^-14 within
+    +-16, vectors are rounded to multiples of 2^-14 before they are compared with them: squared
+    distances are then exact in float64 whatever the order of summation, so neither training nor
+    ``encode`` depends on the linear-algebra library, its threads, or the machine.
     """
 
     stages: tuple[NDArray[np.float16], ...]  # each [words, dimensions]
@@ -265,11 +268,14 @@ class Codebook:
     def train(cls, vectors: Float32, *, words: int, stages: int, seed: int) -> Codebook:
         """Mini-batch k-means, one pass in random order over ``vectors`` [N, dimensions] per stage.
 
-        At most N / 8 words, duplicates removed. Vectors with a coefficient beyond ``AC_RANGE`` are left
-        out. Raises InputError unless words and stages are positive and any vector is left.
+        At most N / 8 words, duplicates removed. Vectors with a coefficient beyond ``AC_RANGE``
+        are left out. Raises InputError unless words and stages are positive and any vector is
+        left.
         """
         if words < 1 or words > TOP + 1 or stages < 1:
-            raise InputError(f"codebook needs 1..65536 words and >= 1 stages, not {words}, {stages}")
+            raise InputError(
+                f"codebook needs 1..65536 words and >= 1 stages, not {words}, {stages}"
+            )
         rest = _on_grid(vectors[(np.abs(vectors) <= AC_RANGE).all(axis=1)])
         if not len(rest):
             raise InputError(f"codebook needs a vector with all coefficients within {AC_RANGE:g}")
@@ -292,15 +298,17 @@ class Codebook:
         return sum(book.nbytes for book in self.stages)
 
     def encode(self, vectors: Float32) -> tuple[UInt16, Mask]:
-        """Nearest words [N, stages], and per row whether no coefficient is off by more than ``AC_ERROR``."""
-        valid = (np.abs(vectors) <= AC_RANGE).all(axis=1)
+        """Nearest words [N, stages], and per row whether no coefficient is off by more than
+        ``AC_ERROR``.
+        """
+        valid: Mask = np.all(np.abs(vectors) <= AC_RANGE, axis=1)
         rest = _on_grid(np.where(valid[:, None], vectors, 0.0))
         codes = np.empty((len(vectors), len(self.stages)), np.uint16)
         for stage, book in enumerate(self.stages):
             codes[:, stage] = _nearest(rest, book)
             rest -= book[codes[:, stage]]
         errors = np.abs(self.decode(codes).astype(np.float64) - vectors)
-        return codes, valid & (errors <= AC_ERROR).all(axis=1)
+        return codes, valid & np.all(errors <= AC_ERROR, axis=1)
 
     def decode(self, codes: UInt16) -> Float32:
         """Sums of words [N, dimensions]; exact in float32."""
@@ -343,8 +351,9 @@ def _nearest(vectors: Float64, book: NDArray[np.float16]) -> NDArray[np.int64]:
 
 
 def _nearest_range(begin: int, end: int, vectors: Float64, book: Float64, best: Any) -> None:
-    """Distances in float32 first; rows whose two best differ by less than the rounding bound of a dot
-    product in any order are decided by exact distances in float64."""
+    """Distances in float32 first; rows whose two best differ by less than the rounding bound of a
+    dot product in any order are decided by exact distances in float64.
+    """
     norms = (book * book).sum(axis=1)
     narrow = np.vstack([-2 * book.T, norms]).astype(np.float32)
     longest = math.sqrt(norms.max())
@@ -368,6 +377,7 @@ def _nearest_range(begin: int, end: int, vectors: Float64, book: Float64, best: 
 def record_bytes(sh_degree: int, stages: int) -> float:
     """Bytes of one coded Gaussian before entropy coding, without tile, ids and node sphere.
 
-    Position, scales and DC colour 3 x 2, rotation 3 x 2 and 2 bits, opacity 2, 2 per codebook stage.
+    Position, scales and DC colour 3 x 2, rotation 3 x 2 and 2 bits, opacity 2, 2 per codebook
+    stage.
     """
     return 26.25 + (2.0 * stages if sh_degree else 0.0)

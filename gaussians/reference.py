@@ -122,8 +122,7 @@ def project(scene: Scene, rig: StereoRig, eye: Eye) -> tuple[ReferenceSplats, Re
     """The splats one eye draws, in drawing order, and what was culled (for both eyes alike)."""
     if eye not in ("left", "right"):
         raise InputError(f'eye must be "left" or "right", not {eye!r}')
-    if len(scene):
-        scene.validate()
+    scene.validate()
     with np.errstate(all="ignore"):
         x_left, y, z = _camera_coordinates(scene.means, rig)
         x_right = x_left - np.float32(rig.baseline_m)

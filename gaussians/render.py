@@ -151,13 +151,15 @@ def _frame_work(
         duplicates=0,
     )
     if forwarding is not None:
-        rest = left.work.entries - left.work.processed
+        rest = np.zeros_like(forwarding.forward_only)
+        if method.forwarding == "carrier":
+            first = max(0, -forwarding.shift)  # plane column of the left window's first tile
+            window = rest[:, first : first + grid.tiles_x]
+            window[:] = left.work.entries - left.work.processed
         stereo = StereoWork(
             fifo_entries=forwarding.fifo_entries,
             forward_only=forwarding.forward_only,
-            walked_after_termination=rest
-            if method.forwarding == "carrier"
-            else np.zeros_like(rest),
+            walked_after_termination=rest,
             dropped=forwarding.dropped,
             duplicates=forwarding.duplicates,
         )

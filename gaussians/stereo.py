@@ -95,6 +95,7 @@ class StereoForwarding:
     lists: TileLists  # right eye
     fifo_entries: NDArray[np.int32]  # [rows, tiles_y, tiles_x] by destination right tile
     forward_only: NDArray[np.int32]  # [tiles_y, plane tiles] by carrying left tile
+    shift: int  # right-window tile column + shift = column of the left window
     dropped: int
     duplicates: int
 
@@ -283,7 +284,7 @@ def forward(
     run_chunks(kernel, grid.tiles_y, filling, *arguments)
     lists, duplicates = _merged_lists(starts, ends, filling.entries, counts)
     by_row = np.ascontiguousarray(np.moveaxis(counts, 2, 0))
-    return StereoForwarding(lists, by_row, forward_only, dropped, duplicates)
+    return StereoForwarding(lists, by_row, forward_only, shift, dropped, duplicates)
 
 
 def _merged_lists(

@@ -33,11 +33,11 @@ class StereoWork:
     All zero for independent eyes.
     """
 
+    # Tile columns of the plane: those of the left window, and where the right window reaches beyond
+    # it, virtual ones that only forward.
     fifo_entries: Int32  # [rows, tiles_y, tiles_x] writes into row k destined for right tile x
-    forward_only: (
-        Int32  # [tiles_y, plane_tiles_x] entries added to a left tile for forwarding alone
-    )
-    walked_after_termination: Int32  # [tiles_y, plane_tiles_x] entries read only for the SRU
+    forward_only: Int32  # [tiles_y, plane tiles] forwards by entries added to a left tile for them
+    walked_after_termination: Int32  # [tiles_y, plane tiles] entries read only for the SRU
     dropped: int  # forwards lost because the disparity exceeds the rows (method `paper`)
     duplicates: int  # equal heads the merge unit dropped
 

@@ -66,7 +66,8 @@ def generate_city(leaves: int, seed: int, sh_degree: int = 3) -> City:
     """A city of exactly ``leaves`` Gaussians, the same bits for the same arguments everywhere.
 
     160 m x 160 m of houses, streets, trees and cars under a sky. The distance between neighbouring
-    splats grows with their distance from the walk, and follows from the number of leaves. Raises
+    splats grows with their distance from the walk, and follows from the number of leaves. Takes about
+    0.5 KB of memory per leaf at degree 3. Raises
     InputError unless 1 000 <= leaves <= 20 000 000, seed >= 0 and sh_degree in 0..3.
     """
     if not MIN_LEAVES <= leaves <= MAX_LEAVES:
@@ -92,7 +93,7 @@ def generate_city(leaves: int, seed: int, sh_degree: int = 3) -> City:
 
 
 def walk_distance(points: Float64) -> Float64:
-    """[Q] metres that set the density at points [Q, 3]: distance to the walk, plus some to its start."""
+    """[Q] metres that set the density at points [Q, 3]: distance to the walk and to its start."""
     x, y, z = points.T
     aside = x - np.clip(x, *_WALK_X)
     up = z - EYE_HEIGHT_M
@@ -122,7 +123,7 @@ class _Sampler:
     ) -> tuple[Chunk, Chunk]:
         """Chunks with ``count`` splats in all, spread over rectangles and crowns by weight."""
         counts = systematic_counts(self.weights, count, rng.random())
-        shares = self.weights * (count / self.weights.sum())
+        shares = self.weights * (count / np.cumsum(self.weights)[-1])
         spread = np.minimum(shape.reach * np.sqrt(self.areas / shares), self.most)
         cut = len(self.ids)
         surface = self._on_cells(rng, counts[:cut], spread[:cut], opacity, shape)
@@ -162,7 +163,7 @@ class _Sampler:
 
 
 def _cells(patches: Patches) -> tuple[Ids, Float64, Float64]:
-    """Rectangle, corner (u, v) and size of every cell; a cell is small compared with its distance."""
+    """Rectangle, corner (u, v) and size of every cell; cells are small against their distance."""
     ids = np.arange(len(patches))
     corners, sizes = np.zeros((len(patches), 2)), patches.lengths.copy()
     done: list[tuple[Ids, Float64, Float64]] = []
@@ -212,7 +213,7 @@ def _sky(rng: np.random.Generator, count: int) -> Chunk:
 
 
 def _floaters(rng: np.random.Generator, count: int) -> Chunk:
-    """Faint blobs in the air of the main street, as training leaves them; none close to the walk."""
+    """Faint blobs over the main street, as training leaves them; none close to the walk."""
     low, high = np.array([-76.0, -7.0, 0.3]), np.array([76.0, 7.0, 14.0])
     means = low + (high - low) * rng.random((count, 3))
     y, up = means[:, 1], means[:, 2] - EYE_HEIGHT_M

@@ -78,8 +78,8 @@ def _main_street(builder: GeometryBuilder) -> None:
             builder.floor((x0, low), (x1, high), KERB_M, Material.PAVEMENT, _PAVING)
     builder.floor((c0, -edge), (c1, edge), 0.0, Material.ASPHALT, _ASPHALT)
     for x0 in (c0 - 3.6, c1 + 0.6):
-        low, high = (x0, 0.3 - edge), (x0 + 3.0, edge - 0.3)
-        builder.floor(low, high, 0.006, Material.ZEBRA, _ASPHALT, along_y=True)
+        corners = (x0, 0.3 - edge), (x0 + 3.0, edge - 0.3)
+        builder.floor(*corners, 0.006, Material.ZEBRA, _ASPHALT, along_y=True)
 
 
 def _cross_street(builder: GeometryBuilder) -> None:

@@ -1,8 +1,8 @@
 """Random numbers whose bits depend on no mathematical library.
 
-NumPy's sin, exp, log and pow, and the distributions built on them, may differ in the last bit between
-processors. Everything here uses +, -, *, /, sqrt, integers and table look-up only, so that a seed gives
-the same scene on every machine.
+NumPy's sin, exp, log and pow, and the distributions built on them, may differ in the last bit
+between processors. Everything here uses +, -, *, /, sqrt, integers and table look-up only, so that
+a seed gives the same scene on every machine.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def value_noise(seed: NDArray[np.uint32], x: Float64, y: Float64) -> Float64:
 
 
 def unit_circle(turns: Float64) -> tuple[Float64, Float64]:
-    """(x, y) on the unit circle at about ``turns`` full turns: exact length, angle within 1 degree."""
+    """(x, y) on the unit circle at ``turns`` >= 0 full turns; the angle is good to a degree."""
     octant = np.floor(turns * 8.0)
     t = (turns * 8.0 - octant) * 0.41421356237309503  # tan(pi / 8)
     x, y = (1.0 - t * t) / (1.0 + t * t), 2.0 * t / (1.0 + t * t)
@@ -103,7 +103,8 @@ def unit_circle(turns: Float64) -> tuple[Float64, Float64]:
 def systematic_counts(weights: Float64, total: int, start: float) -> NDArray[np.int64]:
     """Whole numbers that sum to ``total`` and differ by less than one from their share of it.
 
-    Systematic sampling: the running sum of the shares, shifted by ``start`` in [0, 1), is rounded down.
+    Systematic sampling: the running sum of the shares, shifted by ``start`` in [0, 1), is rounded
+    down.
     """
     running = np.cumsum(weights)
     edges = np.floor(running * (total / running[-1]) + start).astype(np.int64)

@@ -38,8 +38,8 @@ class Material(IntEnum):
 class Patches:
     """M rectangles ``origin + u*axis_u + v*axis_v`` with 0 <= u <= length_u, 0 <= v <= length_v.
 
-    ``axis_u``, ``axis_v`` and ``normals`` = axis_u x axis_v are orthonormal; the normal points to the
-    side from which the rectangle is meant to be seen.
+    ``axis_u``, ``axis_v`` and ``normals`` = axis_u x axis_v are orthonormal; the normal points to
+    the side from which the rectangle is meant to be seen.
     """
 
     origins: Float64  # [M, 3] metres, world, z up
@@ -204,9 +204,9 @@ class GeometryBuilder:
 
     def _build_crowns(self) -> Crowns:
         columns = list(zip(*self._crowns, strict=True)) or [(), (), (), (), ()]
-        vectors = (np.array(columns[i], np.float64).reshape(-1, 3) for i in range(3))
-        seeds = np.array(columns[3], np.uint32)
-        return Crowns(*vectors, seeds, np.array(columns[4], np.float64))
+        centres, radii, tints = (np.array(columns[i], np.float64).reshape(-1, 3) for i in range(3))
+        seeds, exposures = np.array(columns[3], np.uint32), np.array(columns[4], np.float64)
+        return Crowns(centres, radii, tints, seeds, exposures)
 
 
 def _lengths(vectors: Float64) -> Float64:

@@ -52,8 +52,8 @@ def cast(
 ) -> tuple[Float64, NDArray[np.int32]]:
     """Depths [ny, nx, LAYERS] in metres, nearest first, and what was hit [ny, nx, LAYERS] int32.
 
-    A hit is the index of a rectangle, or the number of rectangles plus the index of a crown; -1 (depth
-    infinite) where a ray meets nothing more. Rectangles are hit from both sides.
+    A hit is the index of a rectangle, or the number of rectangles plus the index of a crown; -1
+    (depth infinite) where a ray meets nothing more. Rectangles are hit from both sides.
     """
     patches, crowns = geometry.patches, geometry.crowns
     shape = (*grid.jitter.shape[:2], LAYERS)

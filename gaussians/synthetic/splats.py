@@ -21,6 +21,7 @@ Ids = NDArray[np.int64]
 OPAQUE_SHARE = 0.40  # of all splats; the others follow Beta(0.8, 2.8)
 FAINTEST = 0.006  # trained scenes are pruned just above 1/255
 _THICKNESS = 0.12  # of a surface splat, relative to its spread
+_OFF_SURFACE_M = 0.03  # centres scatter off their surface by no more
 _LONGEST = 3.0  # growth along a narrow rectangle; longer splats smear at the image edge
 _SH_AMPLITUDE = 0.06  # standard deviation of the coefficients of degree l is this / l
 _SH_LOBES = 256  # materials share reflection lobes; half of the variance is per splat
@@ -69,9 +70,9 @@ def surface_splats(
 ) -> Chunk:
     """Flat Gaussians at ``place`` = (u, v) [Q] metres on the rectangles ``ids`` [Q].
 
-    ``spread`` [Q] is the standard deviation in metres that leaves no gaps. Across a rectangle narrower
-    than that the splat shrinks, and grows along it instead; centres keep off the edges, so that
-    silhouettes stay sharp.
+    ``spread`` [Q] is the standard deviation in metres that leaves no gaps. Across a rectangle
+    narrower than that the splat shrinks, and grows along it instead; centres keep off the edges, so
+    that silhouettes stay sharp.
     """
     count = len(ids)
     lengths = patches.lengths[ids]
@@ -85,7 +86,7 @@ def surface_splats(
     where = np.clip(np.stack(place, axis=1), margin, lengths - margin)
     colours = surface_colours(patches, ids, place[0], place[1])
     depth = near_normal(rng, (count,)) * shape.jitter * spread
-    lift = np.clip(depth, -0.25 * lengths.min(axis=1), 0.03)
+    lift = np.clip(depth, -_OFF_SURFACE_M, _OFF_SURFACE_M)
     means = patches.origins[ids] + lift[:, None] * patches.normals[ids]
     means += where[:, :1] * patches.axis_u[ids] + where[:, 1:] * patches.axis_v[ids]
     turned = (rng.random(count) * 2.0 - 1.0) * shape.turn * (lost.max(axis=1) <= 1.0)
@@ -136,14 +137,13 @@ def assemble(rng: np.random.Generator, chunks: list[Chunk], sh_degree: int) -> S
         raise InputError(f"sh_degree must be 0, 1, 2 or 3, not {sh_degree}")
     count = sum(len(c.means) for c in chunks)
     order = rng.permutation(count)
-    plain = [
+    means, quaternions, scales, opacities, colours = (
         np.concatenate([getattr(c, field) for c in chunks]).astype(np.float32)[order]
         for field in ("means", "quaternions", "scales", "opacities", "colours")
-    ]
-    lobes = np.concatenate([c.lobes for c in chunks])[order]
-    return Scene(*plain[:4], _harmonics(rng, plain[4], lobes, sh_degree)).validate(
-        "synthetic scene"
     )
+    lobes = np.concatenate([c.lobes for c in chunks])[order]
+    sh = _harmonics(rng, colours, lobes, sh_degree)
+    return Scene(means, quaternions, scales, opacities, sh).validate("synthetic scene")
 
 
 def _harmonics(

@@ -21,7 +21,7 @@ _SHOP_M, _STOREY_M, _BAY_M = 3.9, 3.15, 2.7  # of a facade, from the ground up
 
 @dataclass(frozen=True)
 class Points:
-    """Q points of one material: place on the rectangle, size of the rectangle, seed, base colour."""
+    """Q points of one material: place and size on the rectangle, seed, base colour."""
 
     u: Float64  # [Q] metres along the rectangle
     v: Float64  # [Q]

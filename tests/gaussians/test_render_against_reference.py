@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from numpy.typing import NDArray
 
-from gaussians import reference
+from gaussians import parallel, reference
 from gaussians.render import StereoFrame, render_mono, render_stereo
 from gaussians.stereo import PRESETS
 from gaussians.work import EyeWork
@@ -78,6 +77,13 @@ def test_one_eye_alone_culls_what_the_pair_culls() -> None:
         assert_same_bits(render_mono(case.scene, case.rig)[0], wanted.image)
 
 
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_each_kind_of_trouble_many_times(kind: str) -> None:
+    for seed in range(20):
+        case = build_case([(kind, 100 + seed)], small_rig())
+        assert_frame_is_the_reference(render(case, "exact"), case)
+
+
 @pytest.mark.nojit
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_each_kind_of_trouble_on_its_own(kind: str) -> None:
@@ -99,15 +105,20 @@ def test_an_empty_scene_is_background() -> None:
 def test_the_frame_does_not_depend_on_the_number_of_threads(method: str) -> None:
     groups = [(kind, seed) for kind in ("wall", "ordinary", "needles") for seed in range(3)]
     case = build_case(groups, small_rig(40, 40), degree=3)
-    before = numba.get_num_threads()
+    before = parallel.threads()
     frames = []
     try:
-        for threads in (1, min(2, before)):
-            numba.set_num_threads(threads)
+        for count in (1, 2, 5):
+            parallel.set_threads(count)
             frames.append(render(case, method))
     finally:
-        numba.set_num_threads(before)
-    one, two = frames
+        parallel.set_threads(before)
+    for other in frames[1:]:
+        assert_equal_frames(frames[0], other)
+
+
+def assert_equal_frames(one: StereoFrame, two: StereoFrame) -> None:
+    """Images, lists and per-tile work, to the bit."""
     for name in ("left", "right", "left_transmittance", "right_transmittance"):
         assert_same_bits(getattr(one, name), getattr(two, name))
     for lists in ("left_lists", "right_lists"):
