@@ -54,13 +54,15 @@ class Clock(Provenance):
 class DecoderTiming(Provenance):
     """Codebook and width of the attribute decoder."""
 
-    codebook_words: int  # codewords of the spherical-harmonic codebook
+    codebook_words: int  # codewords per stage of the spherical-harmonic codebook
+    codebook_stages: int  # residual stages: so many words are read and added per splat
     codebook_buffer_kib: int  # on-chip part; the rest stays in DRAM
     bytes_per_cycle: int  # decoded bytes written per cycle
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require_integers(1, "codebook_words", "codebook_buffer_kib", "bytes_per_cycle")
+        self.require_integers(1, "codebook_words", "codebook_stages")
+        self.require_integers(1, "codebook_buffer_kib", "bytes_per_cycle")
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,9 @@ WORD_BYTES = 16
 
 
 def decoder(config: AcceleratorConfig, work: FrameWork, client: ClientWork) -> UnitReport:
-    """Cycles = coded splats * ceil(decoded bytes / width) + escaped ones * ceil(plain bytes /
-    width).
+    """Cycles = coded splats * (ceil(decoded bytes / width) + (stages - 1) * ceil(word / width)) +
+    escaped ones * ceil(plain bytes / width): the first word is part of the record, the words of
+    further stages are added to it.
 
     With decoded records in DRAM the payloads that arrived in this frame pass once; with
     ``compressed_in_dram`` every splat handed to projection passes in every frame. Codewords beyond
@@ -35,13 +36,14 @@ def decoder(config: AcceleratorConfig, work: FrameWork, client: ClientWork) -> U
     if config.splat_record.layout == "compressed_in_dram":
         passes = 1 if work.shared_front_end else 2
         coded, output_bytes = work.front_end.submitted * passes, plain_bytes(degree)
+    word, stages = codeword_bytes(degree), timing.codebook_stages
     cycles = coded * ceil_div(output_bytes, timing.bytes_per_cycle)
+    cycles += coded * (stages - 1) * ceil_div(word, timing.bytes_per_cycle)
     cycles += client.escaped_splats * ceil_div(plain_bytes(degree), timing.bytes_per_cycle)
-    word = codeword_bytes(degree)
     if word:
-        codebook = timing.codebook_words * word
+        codebook = timing.codebook_words * stages * word
         missing = max(0, codebook - timing.codebook_buffer_kib * 1024)
-        missed = ceil_div(coded * missing, codebook)
+        missed = ceil_div(coded * stages * missing, codebook)
         sentence = "codewords that are not in the codebook buffer"
         streams.append(Stream("codebook", sentence, read_bytes=missed * word, granule_bytes=word))
     return UnitReport(
@@ -52,7 +54,7 @@ def decoder(config: AcceleratorConfig, work: FrameWork, client: ClientWork) -> U
         config.decoder.fill.latency_cycles,
         {
             "attributes_dequantised": coded * (PLAIN_ATTRIBUTES + CHANNELS),
-            "codebook_words_read": coded * ceil_div(word, WORD_BYTES),
+            "codebook_words_read": coded * stages * ceil_div(word, WORD_BYTES),
         },
         tuple(streams),
     )

@@ -24,21 +24,23 @@ def bytes_of(report: UnitReport, name: str) -> tuple[int, int]:
 
 
 def test_record_layouts(nebula: AcceleratorConfig) -> None:
-    sizes = {"decoded_fp32": (236, 56), "decoded_fp16": (118, 28), "compressed_in_dram": (30, 28)}
+    sizes = {"decoded_fp32": (236, 56), "decoded_fp16": (118, 28), "compressed_in_dram": (36, 28)}
     for layout, (degree3, degree0) in sizes.items():
         record = changed(nebula.splat_record, "layout", layout)
         assert (record_bytes(record, 3), record_bytes(record, 0)) == (degree3, degree0)
 
 
 def test_decoder_on_arrival(nebula: AcceleratorConfig) -> None:
-    """236 B at 64 B per cycle: 4 cycles a splat, escaped or not; 90 B codewords, 4096 of them."""
+    """236 B at 64 B per cycle: 4 cycles a splat, escaped or not; 8 stages of 256 codewords of 90 B,
+    seven of which take 2 cycles each to be added."""
     work = frame(eye([[1]]), eye([[1]]))
     report = decoder(
         nebula, work, client(decoded_splats=1000, escaped_splats=10, received_bytes=777)
     )
-    assert report.cycles == 1000 * 4
-    assert report.counts == {"attributes_dequantised": 990 * 14, "codebook_words_read": 990 * 6}
-    missed = -(-990 * (4096 * 90 - 16 * 1024) // (4096 * 90))
+    assert report.cycles == 1000 * 4 + 990 * 7 * 2
+    words_read = 990 * 8 * 6
+    assert report.counts == {"attributes_dequantised": 990 * 14, "codebook_words_read": words_read}
+    missed = -(-990 * 8 * (2048 * 90 - 16 * 1024) // (2048 * 90))
     assert bytes_of(report, "codebook") == (missed * 90, 0)
     assert bytes_of(report, "incoming_stream") == (777, 777)
     assert bytes_of(report, "new_records") == (0, 236_000)
@@ -47,9 +49,9 @@ def test_decoder_on_arrival(nebula: AcceleratorConfig) -> None:
 def test_decoder_behind_dram_decodes_what_is_drawn(nebula: AcceleratorConfig) -> None:
     config = changed(nebula, "splat_record.layout", "compressed_in_dram")
     stereo = frame(eye([[1]]), eye([[1]]), np.zeros((4, 1, 1)), splats=50)
-    assert decoder(config, stereo, client(50)).cycles == 50 * 4
+    assert decoder(config, stereo, client(50)).cycles == 50 * (4 + 7 * 2)
     independent = frame(eye([[1]]), eye([[1]]), splats=50)
-    assert decoder(config, independent, client(50)).cycles == 2 * 50 * 4
+    assert decoder(config, independent, client(50)).cycles == 2 * 50 * (4 + 7 * 2)
 
 
 def test_no_decoder_leaves_the_traffic(gscore: AcceleratorConfig) -> None:

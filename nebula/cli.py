@@ -1,0 +1,322 @@
+"""The command line: options in, one result or one line of error out.
+
+Commands import what they need when they run, so that ``nebula --help`` is quick. Each one hands an
+options object of ``nebula.options`` to ``run`` of the module of its own name, which returns a
+``CommandResult``; printing, ``--json`` and every error are handled here, once.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NoReturn, TypeVar
+
+import click
+
+from gaussians.errors import InputError
+from nebula.output import STDOUT, CommandResult, check_json_target, write_json
+
+SUCCESS, INTERNAL_ERROR, USER_ERROR, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
+
+HELP = """NEBULA: stereo Gaussian splatting in the cloud and on an accelerator.
+
+From a scene and a head trace to both images, cycles, energy, area and Mbps.
+"""
+EPILOG = (
+    "Exit status: 0 success; 2 something given is wrong or cannot be read or written; 1 a fault of "
+    "the program; 130 interrupted. NEBULA_TRACEBACK=1 shows where an error came from."
+)
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+class _Finite(click.FloatRange):
+    """A finite number in a range; click alone lets nan pass."""
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> float:
+        number = float(super().convert(value, param, ctx))
+        if not math.isfinite(number):
+            self.fail(f"{value} is not a finite number", param, ctx)
+        return number
+
+
+POSITIVE = _Finite(min=0, min_open=True)
+NOT_NEGATIVE = _Finite(min=0)
+COUNT = click.IntRange(min=1)
+METHODS = click.Choice(["exact", "paper", "independent"])
+UP_AXES = click.Choice(["+x", "-x", "+y", "-y", "+z", "-z"])
+
+
+def _options(*options: Callable[[Function], Function]) -> Callable[[Function], Function]:
+    """One decorator from several, in the order of the help text."""
+
+    def decorate(function: Function) -> Function:
+        for option in reversed(options):
+            function = option(function)
+        return function
+
+    return decorate
+
+
+scene_options = _options(
+    click.option("--scene", metavar="PATH", help="PLY, .splat, SOG, lod-meta.json; else a city."),
+    click.option("--config", metavar="NAME|FILE", help="Scene and placement from configs/scenes/."),
+    click.option("--city-leaves", "--city", type=COUNT, help="Generated city.  [default: 300000]"),
+    click.option("--level", type=click.IntRange(min=0), help="Level of a scene; 0 is the finest."),
+    click.option("--up", type=UP_AXES, help="Up axis.  [default: -y for files, +z for the city]"),
+    click.option("--units-per-metre", type=POSITIVE, help="Scene units per metre.  [default: 1]"),
+)
+seed_option = click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+view_options = _options(
+    click.option("--view", metavar="EX,EY,EZ:LX,LY,LZ", help="Eye and look-at, scene units."),
+    click.option("--near", "near_m", type=POSITIVE, help="Near plane, m.  [default: 0.2]"),
+    click.option("--fov", "fov_deg", type=POSITIVE, help="Horizontal, degrees.  [default: 96]"),
+    click.option("--width", type=int, help="Pixels per eye.  [default: 1024]"),
+    click.option("--height", type=int, help="Pixels per eye.  [default: 1024]"),
+    click.option("--display", metavar="NAME", help="prototype or quest3, instead of the three."),
+)
+baseline_option = click.option(
+    "--baseline",
+    "baseline_m",
+    type=NOT_NEGATIVE,
+    default=0.06,
+    show_default=True,
+    help="Between the eyes, m.",
+)
+trace_options = _options(
+    click.option(
+        "--trace", metavar="NAME|CSV", help="stand, walk, flight, teleport or a recording."
+    ),
+    click.option("--frames", type=COUNT, default=12, show_default=True),
+    click.option("--search-every", type=COUNT, default=4, show_default=True, help="Frames."),
+    click.option(
+        "--tau", "tau_px", type=NOT_NEGATIVE, default=6.0, show_default=True, help="LoD, px."
+    ),
+)
+method_option = click.option("--method", type=METHODS, default="exact", show_default=True)
+accelerator_option = click.option(
+    "--accelerator",
+    metavar="NAME|FILE",
+    default="nebula",
+    show_default=True,
+    help="Or gscore_nebula.",
+)
+threads_option = click.option("--threads", type=int, help="CPU threads.  [default: all cores]")
+json_option = click.option(
+    "--json", "json_target", metavar="FILE", help="Write the result as JSON; - is standard output."
+)
+
+
+def out_option(default: str | None) -> Callable[[Function], Function]:
+    """``--out DIR``; without a default it must be given."""
+    given: dict[str, Any] = {"required": True} if default is None else {"default": default}
+    return click.option(
+        "--out",
+        type=click.Path(path_type=Path),
+        show_default=True,
+        metavar="DIR",
+        help="Files of the same name are replaced, others stay.",
+        **given,
+    )
+
+
+@click.group(
+    help=HELP, epilog=EPILOG, no_args_is_help=False, context_settings={"max_content_width": 100}
+)
+@click.version_option(package_name="nebula-splat", message="nebula %(version)s")
+def cli() -> None:
+    """The group of all commands."""
+
+
+@cli.command()
+@scene_options
+@seed_option
+@view_options
+@trace_options
+@baseline_option
+@click.option("--method", type=METHODS, help="Stereo method.  [default: the accelerator's own]")
+@accelerator_option
+@click.option("--rate-mbps", type=POSITIVE, default=100.0, show_default=True, help="Link rate.")
+@click.option("--latency-ms", type=NOT_NEGATIVE, default=20.0, show_default=True, help="One way.")
+@threads_option
+@out_option("out/simulate")
+@click.option("--html/--no-html", default=True, show_default=True, help="Write report.html too.")
+@json_option
+def simulate(json_target: str | None, **values: Any) -> None:
+    """Replay a head trace through everything and write a report."""
+    from nebula.options import SimulateOptions
+
+    _execute("simulate", SimulateOptions, values, json_target)
+
+
+@cli.command()
+@scene_options
+@seed_option
+@view_options
+@baseline_option
+@method_option
+@threads_option
+@out_option("out/render")
+@json_option
+def render(json_target: str | None, **values: Any) -> None:
+    """Render one stereo frame as PNG files."""
+    from nebula.options import RenderOptions
+
+    _execute("render", RenderOptions, values, json_target)
+
+
+@cli.command()
+@scene_options
+@seed_option
+@json_option
+def info(json_target: str | None, **values: Any) -> None:
+    """Say what is in a scene."""
+    from nebula.options import InfoOptions
+
+    _execute("info", InfoOptions, values, json_target)
+
+
+@cli.command("build-tree")
+@scene_options
+@seed_option
+@threads_option
+@out_option(None)
+@json_option
+def build_tree(json_target: str | None, **values: Any) -> None:
+    """Build the level-of-detail tree of a scene."""
+    from nebula.options import BuildTreeOptions
+
+    _execute("build_tree", BuildTreeOptions, values, json_target)
+
+
+@cli.command()
+@click.option("--tree", required=True, type=click.Path(path_type=Path), metavar="DIR")
+@seed_option
+@view_options
+@trace_options
+@threads_option
+@json_option
+def search(json_target: str | None, **values: Any) -> None:
+    """Search a stored tree along a head trace."""
+    from nebula.options import SearchOptions
+
+    _execute("search", SearchOptions, values, json_target)
+
+
+@cli.command()
+@accelerator_option
+@click.option("--node", "node_nm", type=click.Choice(["16", "8"]), default="16", show_default=True)
+@click.option(
+    "--technology",
+    type=click.Choice(["deepscaletool", "stillmaker_baas", "none"]),
+    default="deepscaletool",
+    show_default=True,
+    help="Scaling model for a node other than 16 nm.",
+)
+@json_option
+def area(json_target: str | None, **values: Any) -> None:
+    """Print the silicon area of an accelerator, part by part."""
+    from nebula.options import AreaOptions
+
+    values["node_nm"] = float(values["node_nm"])
+    _execute("area", AreaOptions, values, json_target)
+
+
+@cli.command()
+@click.option(
+    "--report", type=click.Path(path_type=Path), metavar="FILE", help="A run's report.json."
+)
+@json_option
+def energy(json_target: str | None, **values: Any) -> None:
+    """Print what every action costs, and the energy of a finished run."""
+    from nebula.options import EnergyOptions
+
+    _execute("energy", EnergyOptions, values, json_target)
+
+
+_SCENE_KEYS = (
+    *("scene", "city_leaves", "level", "up", "units_per_metre", "view", "near_m"),
+    *("fov_deg", "width", "height", "display", "trace"),
+)
+
+
+def _execute(
+    name: str, options: Callable[..., Any], values: dict[str, Any], json_target: str | None
+) -> None:
+    """Run ``nebula.<name>.run`` on its options object; print and write what it returns."""
+    check_json_target(json_target)
+    threads = values.pop("threads", None)
+    if "view" in values or "level" in values:
+        from nebula.options import scene_options
+
+        given = {key: values.pop(key) for key in _SCENE_KEYS if key in values}
+        values["scene"] = scene_options(values.pop("config", None), given)
+    if threads is not None:
+        from gaussians.parallel import set_threads
+
+        set_threads(threads)
+    result: CommandResult = import_module(f"nebula.{name}").run(options(**values))
+    if json_target != STDOUT:
+        click.echo(result.text)
+    if json_target is not None:
+        write_json(json_target, result.data)
+
+
+# ---------------------------------------------------------------- errors
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """The ``nebula`` program: run, report any error in one line, exit with its status."""
+    signal.signal(signal.SIGTERM, _terminate)
+    status = SUCCESS
+    try:
+        with cli.make_context(
+            "nebula", list(sys.argv[1:] if arguments is None else arguments)
+        ) as ctx:
+            cli.invoke(ctx)
+        sys.stdout.flush()
+    except click.exceptions.Exit as end:  # --help, --version
+        status = end.exit_code
+    except BrokenPipeError:  # whoever reads our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (KeyboardInterrupt, click.Abort):
+        _complain("interrupted")
+        status = INTERRUPTED
+    except Exception as error:
+        if os.environ.get("NEBULA_TRACEBACK") == "1":
+            raise
+        message, status = _explain(error)
+        _complain(message)
+    sys.exit(status)
+
+
+def _explain(error: Exception) -> tuple[str, int]:
+    """One line about an error, and the exit status it leads to."""
+    if isinstance(error, click.UsageError):
+        command = error.ctx.command_path if error.ctx else "nebula"
+        return f"{error.format_message()} (see {command} --help)", USER_ERROR
+    if isinstance(error, click.ClickException):
+        return error.format_message(), USER_ERROR
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}", USER_ERROR
+    if isinstance(error, MemoryError):
+        return f"not enough memory: {error}", USER_ERROR
+    if isinstance(error, (InputError, OSError)):
+        return str(error), USER_ERROR
+    kind = type(error).__name__
+    hint = "a fault of the program; NEBULA_TRACEBACK=1 shows where"
+    return f"{kind}: {error} ({hint})", INTERNAL_ERROR
+
+
+def _complain(message: str) -> None:
+    print(f"nebula: error: {' '.join(message.split())}", file=sys.stderr)
+
+
+def _terminate(number: int, frame: object) -> NoReturn:
+    """SIGTERM ends the program by an exception, so that half-written files are removed."""
+    sys.exit(TERMINATED)

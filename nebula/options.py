@@ -1,0 +1,205 @@
+"""What the commands are asked to do, as plain values; light to import.
+
+``SceneConfig`` is what a file in configs/scenes/ may say, ``SceneOptions`` what a command works
+with after file, command line and defaults have been put together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal
+
+from gaussians.cameras import DISPLAYS, Display
+from gaussians.errors import InputError
+from nebula.config import config_path, data_path, load_config
+
+UP_AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
+GENERATED_TRACES = ("stand", "walk", "flight", "teleport")
+CITY_LEAVES = 300_000
+WIDTH_PX = HEIGHT_PX = 1024
+FOV_DEG = 96.0
+NEAR_M = 0.2
+
+
+@dataclass(frozen=True)
+class GeneratedCity:
+    """A scene made by the city generator."""
+
+    city: int  # leaves
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """One file of configs/scenes/: a scene and how to stand in it. None: the default applies.
+
+    Files of ``scene`` and ``trace`` are relative to ``$NEBULA_DATA``.
+    """
+
+    scene: str | GeneratedCity | None = None
+    level: int | None = None
+    up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = None
+    units_per_metre: float | None = None
+    view: str | None = None  # EX,EY,EZ:LX,LY,LZ
+    near_m: float | None = None
+    fov_deg: float | None = None
+    display: str | None = None
+    width: int | None = None
+    height: int | None = None
+    trace: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.display is not None and (self.width or self.height or self.fov_deg):
+            raise InputError("display fixes width, height and fov_deg; give one or the other")
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """Which scene, where in it, seen through which display, moving how."""
+
+    scene: Path | None  # None: the generated city
+    city_leaves: int
+    level: int | None  # of a scene with levels, 0 = finest; None for other scenes
+    up: str | None  # None: -y for files, +z for the city
+    units_per_metre: float
+    view: str | None  # None: framed automatically
+    near_m: float
+    display: Display
+    trace: str  # one of GENERATED_TRACES, or a file
+
+
+@dataclass(frozen=True)
+class SimulateOptions:
+    """``nebula simulate``: the whole line from scene to report."""
+
+    scene: SceneOptions
+    seed: int
+    frames: int
+    method: str | None  # None: the accelerator's own
+    tau_px: float
+    search_every: int
+    accelerator: str
+    rate_mbps: float
+    latency_ms: float
+    baseline_m: float
+    out: Path
+    html: bool
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """``nebula render``: one stereo frame as PNG files."""
+
+    scene: SceneOptions
+    seed: int
+    method: str
+    baseline_m: float
+    out: Path
+
+
+@dataclass(frozen=True)
+class InfoOptions:
+    """``nebula info``: what is in a scene."""
+
+    scene: SceneOptions
+    seed: int
+
+
+@dataclass(frozen=True)
+class BuildTreeOptions:
+    """``nebula build-tree``: a scene to a tree directory."""
+
+    scene: SceneOptions
+    seed: int
+    out: Path
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """``nebula search``: LoD searches along a trace in a stored tree."""
+
+    tree: Path
+    scene: SceneOptions  # only view, display and trace count
+    frames: int
+    tau_px: float
+    search_every: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class AreaOptions:
+    """``nebula area``: the silicon area of an accelerator."""
+
+    accelerator: str
+    node_nm: float
+    technology: Literal["deepscaletool", "stillmaker_baas", "none"]
+
+
+@dataclass(frozen=True)
+class EnergyOptions:
+    """``nebula energy``: the cost table, and the parts of a finished run."""
+
+    report: Path | None
+
+
+def scene_options(config: str | None, given: Mapping[str, Any]) -> SceneOptions:
+    """Command line over configuration file over defaults.
+
+    Parameters
+    ----------
+    config : a shipped name of configs/scenes/ or a YAML file; None for no file.
+    given : values by field of ``SceneConfig``, and ``city_leaves``; None where the command line is
+        silent. ``scene`` and ``trace`` are relative to the current folder.
+
+    Raises InputError for a file that is not there and for values that contradict each other.
+    """
+    path = None if config is None else config_path(config, "scenes")
+    file = SceneConfig() if path is None else load_config(SceneConfig, path, path.stem)
+    given = {key: value for key, value in given.items() if value is not None}
+    if "city_leaves" in given:
+        if "scene" in given:
+            raise InputError("--scene and --city-leaves exclude each other; give one of them")
+        given["scene"] = GeneratedCity(given["city_leaves"])
+    chosen = {f.name: given.get(f.name, getattr(file, f.name)) for f in fields(SceneConfig)}
+    scene, trace = chosen["scene"], chosen["trace"] or "walk"
+    if isinstance(scene, str) and "scene" not in given:
+        scene = data_path(scene, f"{path}: scene")
+    if trace not in GENERATED_TRACES and "trace" not in given:
+        trace = str(data_path(trace, f"{path}: trace"))
+    city = isinstance(scene, GeneratedCity)
+    return SceneOptions(
+        scene=None if city or scene is None else Path(scene),
+        city_leaves=scene.city if isinstance(scene, GeneratedCity) else CITY_LEAVES,
+        level=chosen["level"],
+        up=chosen["up"],
+        units_per_metre=_default(chosen["units_per_metre"], 1.0),
+        view=chosen["view"],
+        near_m=_default(chosen["near_m"], NEAR_M),
+        display=_display(given, file),
+        trace=trace,
+    )
+
+
+def _display(given: Mapping[str, Any], file: SceneConfig) -> Display:
+    """A preset, or width, height and field of view; the command line's kind replaces the file's."""
+    names = ("width", "height", "fov_deg")
+    sized = [name for name in names if name in given]
+    if "display" in given and sized:
+        raise InputError(
+            f"--display {given['display']} fixes {', '.join(sized)}; give one or the other"
+        )
+    preset = given.get("display") or (None if sized else file.display)
+    if preset is not None:
+        if preset not in DISPLAYS:
+            raise InputError(f"display must be one of {', '.join(DISPLAYS)}, not '{preset}'")
+        return DISPLAYS[preset]
+    width, height, fov_deg = (
+        _default(given.get(name, getattr(file, name)), value)
+        for name, value in zip(names, (WIDTH_PX, HEIGHT_PX, FOV_DEG), strict=True)
+    )
+    return Display.from_fov(width, height, fov_deg)
+
+
+def _default(value: Any, default: Any) -> Any:
+    return default if value is None else value

@@ -1,0 +1,108 @@
+"""From what a command was asked for to a scene in metres, a placed head trace, and provenance."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gaussians.cameras import Pose
+from gaussians.errors import InputError
+from gaussians.formats import load_scene
+from gaussians.placement import Placement, Point, View, anchor, parse_view
+from gaussians.poses import HeadTrace, generate_trace, read_eyenavgs, resample
+from gaussians.scene import Scene
+from gaussians.synthetic import generate_city
+from nebula.options import GENERATED_TRACES, SceneOptions
+from nebula.progress import progress
+
+DISPLAY_RATE_HZ = 90.0  # paper Sec. 3.3 and 7.3
+
+
+@dataclass(frozen=True)
+class SceneInput:
+    """A scene in metres, where the viewer stands in it, and where both came from."""
+
+    name: str
+    generated: bool
+    scene: Scene
+    placement: Placement
+    view: Pose  # head pose of the first frame, metres
+    walkable_path: tuple[Point, ...]  # metres; empty for files
+    files: tuple[Path, ...]
+
+
+def load(options: SceneOptions, seed: int) -> SceneInput:
+    """Read or generate the scene, convert it to metres and find the first view.
+
+    Raises InputError for anything wrong with file or placement.
+    """
+    path: tuple[Point, ...] = ()
+    files: list[Path] = []
+    default_up: str = "-y"
+    default_view: View | None = None
+    if options.scene is None:
+        with progress(f"generating a city of {options.city_leaves} leaves"):
+            city = generate_city(options.city_leaves, seed)
+        name, scene = f"city of {options.city_leaves} leaves, seed {seed}", city.scene
+        default_up, default_view = city.up, (_point(city.eye), _point(city.target))
+        path = tuple(_point(p) for p in city.path)
+    else:
+        with progress(f"reading {options.scene}"):
+            scene, files = load_scene(options.scene, options.level)
+        name = options.scene.name
+    placement = Placement(
+        up=options.up or default_up,
+        units_per_metre=options.units_per_metre,
+        view=default_view if options.view is None else parse_view(options.view),
+        near_m=options.near_m,
+    )
+    return SceneInput(
+        name=name,
+        generated=options.scene is None,
+        scene=scene.scaled(1.0 / placement.units_per_metre),
+        placement=placement,
+        view=placement.view_pose(scene),
+        walkable_path=path,
+        files=tuple(files),
+    )
+
+
+def _point(coordinates: Sequence[float] | NDArray[np.float64]) -> Point:
+    x, y, z = (float(c) for c in coordinates)
+    return x, y, z
+
+
+def head_trace(name: str, view: Pose, up: str, frames: int, seed: int) -> HeadTrace:
+    """``frames`` poses at 90 Hz of a generated or recorded trace, starting at ``view``.
+
+    Raises InputError when a recording cannot be read or is too short.
+    """
+    if name in GENERATED_TRACES:
+        relative = generate_trace(name, frames, np.random.default_rng(seed))
+    else:
+        relative = resample(read_eyenavgs(Path(name)), DISPLAY_RATE_HZ, frames)
+    return anchor(relative, view, up)
+
+
+def describe_files(files: Iterable[Path]) -> list[dict[str, str | int]]:
+    """Path, size and SHA-256 of every file read, for the report."""
+    described: list[dict[str, str | int]] = []
+    for path in files:
+        content = path.read_bytes()
+        digest = hashlib.sha256(content).hexdigest()
+        described.append({"name": path.name, "bytes": len(content), "sha256": digest})
+    return described
+
+
+def require_visible(visible: int, what: str) -> None:
+    """A view that sees nothing is a mistake of placement: InputError."""
+    if visible == 0:
+        raise InputError(
+            f"{what}: no splat is visible from this view; "
+            "check --view, --up, --near and --units-per-metre"
+        )
