@@ -35,6 +35,7 @@ EYE_HEIGHT_M = 1.6
 MIN_LEAVES, MAX_LEAVES = 1_000, 20_000_000
 _WALK_X = (-48.0, 60.0)
 _FLOATER_SHARE = 0.06
+_HAZE_FLOATERS = 18_000  # more floaters than this are smaller in turn
 _SKY_SHARE, _SKY_MOST, _SKY_RADIUS_M = 0.015, 4_000, 170.0
 _NEAREST_M = 2.0  # density does not grow further towards the walker
 _LARGEST = 0.08  # standard deviation relative to the distance that sets the density
@@ -66,9 +67,9 @@ def generate_city(leaves: int, seed: int, sh_degree: int = 3) -> City:
     """A city of exactly ``leaves`` Gaussians, the same bits for the same arguments everywhere.
 
     160 m x 160 m of houses, streets, trees and cars under a sky. The distance between neighbouring
-    splats grows with their distance from the walk, and follows from the number of leaves. Takes about
-    0.5 KB of memory per leaf at degree 3. Raises
-    InputError unless 1 000 <= leaves <= 20 000 000, seed >= 0 and sh_degree in 0..3.
+    splats grows with their distance from the walk, and follows from the number of leaves. Takes
+    about 0.5 KB of memory per leaf at degree 3. Raises InputError unless 1 000 <= leaves <=
+    20 000 000, seed >= 0 and sh_degree in 0..3.
     """
     if not MIN_LEAVES <= leaves <= MAX_LEAVES:
         raise InputError(f"city leaves must lie in {MIN_LEAVES}..{MAX_LEAVES}, not {leaves}")
@@ -218,7 +219,10 @@ def _floaters(rng: np.random.Generator, count: int) -> Chunk:
     means = low + (high - low) * rng.random((count, 3))
     y, up = means[:, 1], means[:, 2] - EYE_HEIGHT_M
     means[:, 2] += 3.0 * (y * y + up * up < 2.0)
-    spread = walk_distance(means) * (0.002 + 0.012 * rng.random(count))
+    haze = min(
+        1.0, float(np.sqrt(_HAZE_FLOATERS / max(count, 1)))
+    )  # no thicker air in denser cities
+    spread = walk_distance(means) * (0.002 + 0.012 * rng.random(count)) * haze
     opacities = FAINTEST + 0.06 * rng.random(count)
     colours = 0.35 + 0.4 * rng.random((count, 1)) + 0.15 * rng.random((count, 3))
     return blobs(rng, means, spread, opacities, colours, (1.0, 0.7, 0.5))

@@ -3,9 +3,9 @@ trained street scans cost. Their statistics are part of their definition (config
 
 Each ray of a jittered grid about 2 px apart leaves a splat on up to four surfaces it pierces; the
 grid is wider than the frustum. Near surfaces are thinned to a smallest leaf size. The origin lies
-on the ground under the eye. Depths that are equal as float32 are not planted: among a million depths
-within a few octaves they happen, as they do in trained scenes, and surfaces that face the view axis
-add to them.
+on the ground under the eye. Depths that are equal as float32 are not planted: among a million
+depths within a few octaves they happen, as they do in trained scenes, and surfaces that face the
+view axis add to them.
 """
 
 from __future__ import annotations

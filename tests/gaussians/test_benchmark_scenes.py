@@ -1,21 +1,22 @@
-"""The benchmark views: rays hit what they should, and full-size scenes have the stated statistics."""
+"""The benchmark views: rays hit what they should, full-size scenes have the stated statistics."""
 
 from __future__ import annotations
 
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 
-from gaussians.cameras import StereoRig, look_at
+from gaussians.cameras import Pose, StereoRig, look_at
 from gaussians.errors import InputError
-from gaussians.projection import camera_depths, project
+from gaussians.projection import U, V, camera_depths, project
 from gaussians.rasterization import rasterise
 from gaussians.scene import FIELDS, Scene
 from gaussians.synthetic import BenchmarkView, benchmark_scene
-from gaussians.synthetic.patches import GeometryBuilder, Material
+from gaussians.synthetic.patches import Geometry, GeometryBuilder, Material
 from gaussians.synthetic.raycast import LAYERS, RayGrid, cast
 from gaussians.tiling import TileGrid, row_spans, tile_lists
 
@@ -36,15 +37,15 @@ REQUIRED_OF_STREET = {
 }
 
 
-def mapping(name: str) -> dict[str, object]:
-    return yaml.safe_load((CONFIGS / f"{name}.yaml").read_text(encoding="utf-8"))
+def mapping(name: str) -> dict[str, Any]:
+    return dict(yaml.safe_load((CONFIGS / f"{name}.yaml").read_text(encoding="utf-8")))
 
 
 def load(name: str) -> BenchmarkView:
     return BenchmarkView.from_mapping(mapping(name))
 
 
-def reduced(name: str, **changes: object) -> BenchmarkView:
+def reduced(name: str, **changes: Any) -> BenchmarkView:
     """A few per cent of the rays, far enough apart."""
     return replace(load(name), **{"splats": 15_000, "spacing_px": 14.0, **changes})
 
@@ -126,18 +127,35 @@ def test_a_reduced_view_is_exact_in_number_and_repeatable(name: str) -> None:
     assert (camera_depths(scene, rig) >= rig.near_m).mean() > 0.98
     assert rig.display.fx == 929.2
     assert 0.37 < (scene.opacities >= 0.9).mean() < 0.43
-    assert scene.scales.max(axis=1).min() >= 0.3 * view.smallest_leaf_m
 
 
 def test_eyes_stand_where_the_views_say() -> None:
     heights = {name: load(name).eye_m[2] for name in NAMES}
     assert heights == {"street": 1.6, "elev": 25.0, "near": 1.6}
-    near, street = (benchmark_scene(reduced(name)) for name in ("near", "street"))
-    solid = [
-        np.sort(camera_depths(scene, rig)[scene.opacities > 0.9]) for scene, rig in (near, street)
-    ]
-    assert 0.5 < solid[0][0] < 0.7  # objects from 0.55 m
-    assert (solid[0] < 1.0).sum() > 2 * (solid[1] < 1.0).sum()
+    near, street = (_solid_depths(reduced(name)) for name in ("near", "street"))
+    assert 0.5 < near.min() < 0.65  # objects from 0.55 m
+    assert (near < 1.0).sum() > 20
+    assert (street < 1.0).sum() == 0
+
+
+def _solid_depths(view: BenchmarkView) -> np.ndarray:
+    """Depths of the opaque splats whose centres lie in the left image."""
+    scene, rig = benchmark_scene(view)
+    solid = scene.take(np.flatnonzero(scene.opacities > 0.9))
+    splats = project(solid, rig, eyes=1)
+    u, v = splats.features[0][:, U], splats.features[0][:, V]
+    inside = (u >= 0) & (u < rig.display.width) & (v >= 0) & (v < rig.display.height)
+    return camera_depths(solid, rig)[splats.ids[inside]]
+
+
+def test_near_surfaces_are_thinned_to_the_smallest_leaf() -> None:
+    view = reduced("street", splats=15_000, smallest_leaf_m=0.25)
+    scene, rig = benchmark_scene(view)
+    depths = camera_depths(scene, rig)
+    road = (np.abs(scene.means[:, 2]) < 0.02) & (depths < 7) & (scene.opacities > 0.07)
+    assert 100 < road.sum() < 8 * 7 / 0.25**2  # carriageway, 8 m wide
+    size = np.sqrt(scene.scales[road, 0] * scene.scales[road, 1])
+    assert np.median(size) == pytest.approx(view.spread * 0.25, rel=0.1)
 
 
 @pytest.mark.parametrize(
@@ -151,7 +169,7 @@ def test_eyes_stand_where_the_views_say() -> None:
         ({"splats": 0}, "splats must lie in 1..20000000, not 0"),
     ],
 )
-def test_bad_views_are_refused(change: dict[str, object], message: str) -> None:
+def test_bad_views_are_refused(change: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         replace(load("street"), **change)
 
@@ -161,16 +179,21 @@ def test_unknown_and_missing_keys_are_refused() -> None:
         BenchmarkView.from_mapping({**mapping("street"), "spaceing_px": 2})
     short = mapping("street")
     del short["seed"]
-    with pytest.raises(InputError, match="'street': .* missing .* 'seed'"):
+    with pytest.raises(InputError, match=r"'street': .* missing .* 'seed'"):
         BenchmarkView.from_mapping(short)
 
 
 def test_too_few_rays_are_an_error() -> None:
-    with pytest.raises(InputError, match="fewer than .*; spacing_px must be smaller"):
+    with pytest.raises(InputError, match=r"fewer than .*; spacing_px must be smaller"):
         benchmark_scene(reduced("street", splats=100_000))
 
 
-def random_world(seed: int):  # type: ignore[no-untyped-def]
+def vector(values: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def random_world(seed: int) -> tuple[Geometry, Pose, RayGrid]:
     """A few slanted rectangles and crowns around an eye, some reaching behind it."""
     rng = np.random.Generator(np.random.PCG64(seed))
     builder = GeometryBuilder(rng)
@@ -178,15 +201,16 @@ def random_world(seed: int):  # type: ignore[no-untyped-def]
         first, second = rng.normal(size=3), rng.normal(size=3)
         second -= first * (first @ second) / (first @ first)
         origin = rng.uniform(-3, 3, 3)
-        builder.rectangle(
-            tuple(origin), tuple(3 * first), tuple(3 * second), Material.PLAIN, (0.5,) * 3
-        )
+        corner, u, v = (vector(x) for x in (origin, 3 * first, 3 * second))
+        builder.rectangle(corner, u, v, Material.PLAIN, (0.5, 0.5, 0.5))
     builder.crown((2.0, 0.4, 0.2), (0.9, 0.6, 0.5), (0.2, 0.5, 0.2))
     pose = look_at(np.zeros(3), np.array([1.0, 0.2, -0.1]), np.array([0.0, 0.0, 1.0]))
     return builder.build(), pose, RayGrid.over(rng, 1.2, 0.9, 0.05)
 
 
-def naive_rectangle_depths(geometry, pose, ray, near_m):  # type: ignore[no-untyped-def]
+def naive_rectangle_depths(
+    geometry: Geometry, pose: Pose, ray: np.ndarray, near_m: float
+) -> list[tuple[float, int]]:
     """Depth and index of every rectangle a ray meets beyond the near plane, nearest first."""
     patches = geometry.patches
     direction = pose.rotation @ ray
@@ -213,7 +237,9 @@ def test_rays_hit_what_the_naive_search_finds(seed: int) -> None:
         for column in range(0, columns, 3):
             ray = grid.directions[row, column]
             found = [
-                (z, h) for z, h in zip(depths[row, column], hits[row, column], strict=True) if h >= 0
+                (z, h)
+                for z, h in zip(depths[row, column], hits[row, column], strict=True)
+                if h >= 0
             ]
             solid = [(z, h) for z, h in found if h < crown]
             leafy = [z for z, h in found if h == crown]

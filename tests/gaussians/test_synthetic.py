@@ -17,7 +17,8 @@ from gaussians.scene import FIELDS, Scene
 from gaussians.synthetic import City, generate_city
 from gaussians.synthetic.layout import CARRIAGEWAY_HALF_M, HALF_EXTENT_M, town
 from gaussians.synthetic.noise import systematic_counts, unit_circle, value_noise
-from gaussians.synthetic.splats import translucent
+from gaussians.synthetic.patches import Patches
+from gaussians.synthetic.splats import Shape, surface_splats, translucent
 
 UP = np.array([0.0, 0.0, 1.0])
 GOLDEN = "f545a3916fd80141"
@@ -39,12 +40,6 @@ def city() -> City:
     return generate_city(300_000, seed=1)
 
 
-def thin_axis_z(scene: Scene) -> np.ndarray:
-    """[N] world z component of the local z axis."""
-    _, x, y, _ = scene.quaternions.T
-    return 1 - 2 * (x * x + y * y)
-
-
 def test_same_seed_same_bits_on_every_machine() -> None:
     small = generate_city(3_000, seed=7)
     assert digest(small.scene) == digest(generate_city(3_000, seed=7).scene)
@@ -53,9 +48,7 @@ def test_same_seed_same_bits_on_every_machine() -> None:
 
 
 @settings(max_examples=8, deadline=None)
-@given(
-    leaves=st.integers(1_000, 9_000), seed=st.integers(0, 2**63 - 1), degree=st.integers(0, 3)
-)
+@given(leaves=st.integers(1_000, 9_000), seed=st.integers(0, 2**63 - 1), degree=st.integers(0, 3))
 def test_counts_are_exact_and_scenes_valid(leaves: int, seed: int, degree: int) -> None:
     scene = generate_city(leaves, seed, sh_degree=degree).scene
     assert len(scene.validate()) == leaves
@@ -102,10 +95,63 @@ def test_splats_are_flat_and_lie_in_their_surface(city: City) -> None:
     x, y, z = scene.means.T
     road = (np.abs(y) < 1.9) & (np.abs(z) < 0.01) & (np.abs(x) < 40)
     assert road.sum() > 5_000
-    assert np.median(np.abs(thin_axis_z(scene)[road])) > 0.999
+    assert np.median(np.abs(local_axis(scene.quaternions, 2)[road, 2])) > 0.999
     front = (np.abs(np.abs(y) - 7.5) < 0.02) & (z > 6) & (z < 9) & (np.abs(x + 40) < 30)
     assert front.sum() > 5_000
-    assert np.median(np.abs(thin_axis_z(scene)[front])) < 0.01
+    assert np.median(np.abs(local_axis(scene.quaternions, 2)[front, 2])) < 0.01
+
+
+def test_local_axes_are_those_of_the_rectangle() -> None:
+    rng = generator(5)
+    raw = rng.normal(size=(400, 3, 3))
+    u = raw[:, 0] / np.linalg.norm(raw[:, 0], axis=1, keepdims=True)
+    v = raw[:, 1] - (raw[:, 1] * u).sum(axis=1, keepdims=True) * u
+    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    count = len(u)
+    ones = np.ones(count)
+    patches = Patches(
+        raw[:, 2],
+        u,
+        v,
+        np.full((count, 2), 9.0),
+        np.zeros(count, np.int64),
+        np.full((count, 3), 0.5),
+        np.arange(count, dtype=np.uint32),
+        ones,
+    )
+    for turn in (0.0, 0.4):
+        shape = Shape(reach=0.5, aspect=2.0, turn=turn, jitter=0.0)
+        place = (4.0 * ones, 5.0 * ones)
+        chunk = surface_splats(rng, patches, np.arange(count), place, 0.1 * ones, ones, shape)
+        x_axis, y_axis, z_axis = (local_axis(chunk.quaternions, k) for k in range(3))
+        assert np.allclose(z_axis, patches.normals)
+        cosine, sine = (x_axis * u).sum(axis=1), (x_axis * v).sum(axis=1)
+        assert np.allclose((y_axis * v).sum(axis=1), cosine)
+        assert np.allclose(cosine**2 + sine**2, 1)
+        assert np.degrees(np.abs(np.arctan2(sine, cosine)).max()) == pytest.approx(
+            2 * np.degrees(np.arctan(turn)), abs=1.5
+        )
+        assert np.allclose(chunk.means, raw[:, 2] + 4 * u + 5 * v)
+
+
+def local_axis(quaternions: np.ndarray, index: int) -> np.ndarray:
+    """[N, 3] column of the rotation matrices (gaussians/conventions.md)."""
+    w, x, y, z = quaternions.T
+    columns = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return np.stack(columns[index], axis=1)
+
+
+def test_floaters_are_faint_and_keep_off_the_walk(city: City) -> None:
+    scene = city.scene
+    ratios = scene.scales[:, 1:] / scene.scales[:, :1]
+    floaters = (np.abs(ratios - (0.7, 0.5)) < 1e-5).all(axis=1) & (scene.opacities < 0.07)
+    assert floaters.mean() == pytest.approx(0.06, abs=0.001)
+    _, y, z = scene.means[floaters].T
+    assert np.sqrt(y * y + (z - 1.6) ** 2).min() > 1.4
 
 
 def test_splats_are_smaller_near_the_walk(city: City) -> None:
