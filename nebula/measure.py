@@ -88,7 +88,8 @@ def measure(
         hardware.config, analysis.activity, analysis.timing, hardware.costs, hardware.technology
     )
     own = own_right(frame)
-    psnr = psnr_db(frame.right, own)
+    mismatching = mismatching_pixels(frame.right, own)
+    psnr = psnr_db(frame.right, own) if mismatching else None
     x, y, z = (float(c) for c in eye_m)
     return FrameRecord(
         index=index,
@@ -100,8 +101,8 @@ def measure(
         held_splats=client.selection.held,
         visible=frame.visible,
         covered=covered_shares(frame),
-        mismatching=mismatching_pixels(frame.right, own),
-        mismatching_8bit=mismatching_pixels_8bit(frame.right, own),
+        mismatching=mismatching,
+        mismatching_8bit=mismatching_pixels_8bit(frame.right, own) if mismatching else 0,
         squared_error=0.0 if psnr is None else 10.0 ** (-psnr / 10.0),
         list_entries=(int(work.left.entries.sum()), int(work.right.entries.sum())),
         forward_only=int(stereo.forward_only.sum()),

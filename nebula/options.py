@@ -9,14 +9,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from gaussians.cameras import DISPLAYS, Display
 from gaussians.errors import InputError
-from nebula.config import config_path, data_path, load_config
+from nebula.config import config_path, data_path, load_dataclass, load_yaml
+
+if TYPE_CHECKING:
+    from gaussians.synthetic import BenchmarkView
 
 UP_AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
 GENERATED_TRACES = ("stand", "walk", "flight", "teleport")
+_BENCHMARK_KEY = "spacing_px"  # only a benchmark view has it
 CITY_LEAVES = 300_000
 WIDTH_PX = HEIGHT_PX = 1024
 FOV_DEG = 96.0
@@ -58,8 +62,7 @@ class SceneConfig:
 class SceneOptions:
     """Which scene, where in it, seen through which display, moving how."""
 
-    scene: Path | None  # None: the generated city
-    city_leaves: int
+    scene: Path | GeneratedCity | BenchmarkView
     level: int | None  # of a scene with levels, 0 = finest; None for other scenes
     up: str | None  # None: -y for files, +z for the city
     units_per_metre: float
@@ -154,23 +157,26 @@ def scene_options(config: str | None, given: Mapping[str, Any]) -> SceneOptions:
 
     Raises InputError for a file that is not there and for values that contradict each other.
     """
-    path = None if config is None else config_path(config, "scenes")
-    file = SceneConfig() if path is None else load_config(SceneConfig, path, path.stem)
     given = {key: value for key, value in given.items() if value is not None}
     if "city_leaves" in given:
         if "scene" in given:
             raise InputError("--scene and --city-leaves exclude each other; give one of them")
         given["scene"] = GeneratedCity(given["city_leaves"])
+    path = None if config is None else config_path(config, "scenes")
+    mapping = {} if path is None else load_yaml(path)
+    benchmark = None
+    if path is not None and _BENCHMARK_KEY in mapping:
+        benchmark, file = _benchmark(mapping, path.stem)
+    else:
+        file = load_dataclass(SceneConfig, mapping, "" if path is None else path.stem)
     chosen = {f.name: given.get(f.name, getattr(file, f.name)) for f in fields(SceneConfig)}
     scene, trace = chosen["scene"], chosen["trace"] or "walk"
-    if isinstance(scene, str) and "scene" not in given:
-        scene = data_path(scene, f"{path}: scene")
+    if isinstance(scene, str):
+        scene = Path(scene) if "scene" in given else data_path(scene, f"{path}: scene")
     if trace not in GENERATED_TRACES and "trace" not in given:
         trace = str(data_path(trace, f"{path}: trace"))
-    city = isinstance(scene, GeneratedCity)
     return SceneOptions(
-        scene=None if city or scene is None else Path(scene),
-        city_leaves=scene.city if isinstance(scene, GeneratedCity) else CITY_LEAVES,
+        scene=scene or benchmark or GeneratedCity(CITY_LEAVES),
         level=chosen["level"],
         up=chosen["up"],
         units_per_metre=_default(chosen["units_per_metre"], 1.0),
@@ -179,6 +185,14 @@ def scene_options(config: str | None, given: Mapping[str, Any]) -> SceneOptions:
         display=_display(given, file),
         trace=trace,
     )
+
+
+def _benchmark(mapping: dict[str, Any], name: str) -> tuple[BenchmarkView, SceneConfig]:
+    """A benchmark view of configs/scenes/, and what it says of display and near plane."""
+    from gaussians.synthetic import BenchmarkView
+
+    view = load_dataclass(BenchmarkView, mapping, name)
+    return view, SceneConfig(display=view.display, near_m=view.near_m)
 
 
 def _display(given: Mapping[str, Any], file: SceneConfig) -> Display:

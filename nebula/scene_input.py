@@ -16,8 +16,8 @@ from gaussians.formats import load_scene
 from gaussians.placement import Placement, Point, View, anchor, parse_view
 from gaussians.poses import HeadTrace, generate_trace, read_eyenavgs, resample
 from gaussians.scene import Scene
-from gaussians.synthetic import generate_city
-from nebula.options import GENERATED_TRACES, SceneOptions
+from gaussians.synthetic import BenchmarkView, benchmark_scene, generate_city
+from nebula.options import GENERATED_TRACES, GeneratedCity, SceneOptions
 from nebula.progress import progress
 
 DISPLAY_RATE_HZ = 90.0  # paper Sec. 3.3 and 7.3
@@ -45,16 +45,22 @@ def load(options: SceneOptions, seed: int) -> SceneInput:
     files: list[Path] = []
     default_up: str = "-y"
     default_view: View | None = None
-    if options.scene is None:
-        with progress(f"generating a city of {options.city_leaves} leaves"):
-            city = generate_city(options.city_leaves, seed)
-        name, scene = f"city of {options.city_leaves} leaves, seed {seed}", city.scene
+    source = options.scene
+    if isinstance(source, GeneratedCity):
+        with progress(f"generating a city of {source.city} leaves"):
+            city = generate_city(source.city, seed)
+        name, scene = f"city of {source.city} leaves, seed {seed}", city.scene
         default_up, default_view = city.up, (_point(city.eye), _point(city.target))
         path = tuple(_point(p) for p in city.path)
+    elif isinstance(source, BenchmarkView):
+        with progress(f"generating the view {source.name}"):
+            scene, rig = benchmark_scene(source)
+        name, eye = f"benchmark view {source.name}", rig.pose.position
+        default_up, default_view = "+z", (_point(eye), _point(eye + rig.pose.rotation[:, 2]))
     else:
-        with progress(f"reading {options.scene}"):
-            scene, files = load_scene(options.scene, options.level)
-        name = options.scene.name
+        with progress(f"reading {source}"):
+            scene, files = load_scene(source, options.level)
+        name = source.name
     placement = Placement(
         up=options.up or default_up,
         units_per_metre=options.units_per_metre,
@@ -63,7 +69,7 @@ def load(options: SceneOptions, seed: int) -> SceneInput:
     )
     return SceneInput(
         name=name,
-        generated=options.scene is None,
+        generated=not isinstance(source, Path),
         scene=scene.scaled(1.0 / placement.units_per_metre),
         placement=placement,
         view=placement.view_pose(scene),

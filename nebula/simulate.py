@@ -31,8 +31,8 @@ from nebula.session import Session, StartUp
 from nebula.session_config import SessionConfig, load_session_config
 
 NOTES = (
-    "Timing is of fidelity `analytic`: each unit's cycles are bounds from counters of this run, and "
-    "the slowest unit sets the frame time; no queueing between units is simulated.",
+    "Timing is of fidelity `analytic`: each unit's cycles are bounds from counters of this run, "
+    "and the slowest unit sets the frame time; no queueing between units is simulated.",
     "Search is `flat` (every node, every time); the paper's temporal search is not modelled here, "
     "and the cloud's computing time is an assumption, listed under sources.",
     "The link loses nothing; messages arrive in order.",
@@ -92,11 +92,9 @@ def run(options: SimulateOptions) -> CommandResult:
             outcome = _play(options, setting)
         report = _report(options, setting, outcome, clock)
         validate_report(report)
-        images = {
-            "left": png(outcome.last.left),
-            "right": png(outcome.last.right),
-            "difference": difference_png(outcome.last.right, own_right(outcome.last)),
-        }
+        last = outcome.last
+        images = {"left": png(last.left), "right": png(last.right)}
+        images["difference"] = difference_png(last.right, own_right(last))
         for name, content in images.items():
             out.write_bytes(f"{name}.png", content)
         out.write_json("report.json", report)
@@ -134,7 +132,7 @@ def _prepare(options: SimulateOptions, clock: _Clock) -> _Setting:
 
 
 def _method(options: SimulateOptions, hardware: Hardware) -> StereoMethod:
-    """The method asked for, or the accelerator's own; independent eyes use the accelerator's lists."""
+    """The method asked for or the accelerator's own; independent eyes use the latter's lists."""
     workload = hardware.config.workload
     method = PRESETS[options.method or workload.stereo_method]
     if method.forwarding == "none":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 import string
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -30,12 +31,12 @@ def html_page(report: Mapping[str, Any], images: Mapping[str, Path | bytes]) -> 
     ----------
     report : a report that passes ``validate_report``; InputError otherwise.
     images : PNG files or their bytes by name. ``left``, ``right`` and ``difference`` have captions,
-        any other name is its own.
+        any other name is its own. ``difference`` is left out where it would be black.
     """
     validate_report(report)
     sections = [
         _headline(report),
-        _images(images),
+        _images(images, identical=report["stereo"]["right_mismatching_pixels"] == 0),
         _notes(report["notes"]),
         results.accelerator(report),
         results.streaming(report),
@@ -121,9 +122,11 @@ def _headline(report: Mapping[str, Any]) -> str:
     return f'<div class="tiles">{"".join(tiles)}</div>'
 
 
-def _images(images: Mapping[str, Path | bytes]) -> str:
+def _images(images: Mapping[str, Path | bytes], identical: bool) -> str:
     figures = []
     for name, image in images.items():
+        if identical and name == "difference":
+            continue
         content = image if isinstance(image, bytes) else image.read_bytes()
         data = base64.b64encode(content).decode("ascii")
         caption = escape(CAPTIONS.get(name, name))
@@ -139,5 +142,6 @@ def _images(images: Mapping[str, Path | bytes]) -> str:
 def _notes(notes: Sequence[str]) -> str:
     if not notes:
         return ""
-    items = "".join(f"<li>{escape(note)}</li>" for note in notes)
+    marked = (re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(note)) for note in notes)
+    items = "".join(f"<li>{note}</li>" for note in marked)
     return f'<h2>What is thin here</h2><div class="card notes"><ul>{items}</ul></div>'

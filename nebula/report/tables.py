@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
@@ -74,7 +75,7 @@ def sources(sources: Sequence[Mapping[str, Any]]) -> str:
         mark = escape(s["confidence"])
         value = s["value"]
         lines.append(
-            f'<tr><td class="long">{escape(s["name"])}</td>'
+            f'<tr><td class="name">{_breakable(s["name"])}</td>'
             f"<td>{escape(significant(value) if isinstance(value, float) else plain(value))}</td>"
             f"<td>{escape(s['unit'])}</td><td>{escape(s['source'])}</td>"
             f'<td class="long">{escape(s["reference"])}</td>'
@@ -89,3 +90,8 @@ def sources(sources: Sequence[Mapping[str, Any]]) -> str:
         f'<div class="scroll"><table class="sources"><tr>{head}</tr>{"".join(lines)}</table>'
         "</div></div>"
     )
+
+
+def _breakable(name: str) -> str:
+    """A dotted name as HTML that may break after dots and underscores only."""
+    return re.sub(r"([._])", r"\1<wbr>", escape(name))

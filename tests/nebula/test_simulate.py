@@ -12,7 +12,7 @@ import pytest
 from gaussians import parallel
 from gaussians.cameras import Display
 from gaussians.errors import InputError
-from nebula.options import SceneOptions, SimulateOptions
+from nebula.options import GeneratedCity, SceneOptions, SimulateOptions
 from nebula.report import stable_part, validate_report
 from nebula.simulate import run
 
@@ -22,8 +22,7 @@ FILES = ["difference.png", "left.png", "report.html", "report.json", "right.png"
 
 def options(out: Path, **changes) -> SimulateOptions:
     scene = SceneOptions(
-        scene=None,
-        city_leaves=changes.pop("city_leaves", 5000),
+        scene=GeneratedCity(5000),
         level=None,
         up=None,
         units_per_metre=1.0,

@@ -1,0 +1,102 @@
+"""Where kernels compute in float64, and that they do so nowhere else.
+
+One float64 constant or counter promotes an expression under numba but not under NumPy, and the
+same image has other bits from then on. So the kernels are run once on something small, and their
+types are read.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import pytest
+
+from gaussians.synthetic import generate_city
+from lod_cloud import build_tree, prove_nesting
+from nebula import simulate
+from nebula.options import SimulateOptions, scene_options
+from tests.kernel_types import float64_variables, is_inlined, project_kernels
+
+pytestmark = pytest.mark.skipif(
+    os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="needs numba's compiler"
+)
+
+# Kernels that may use float64, and why; every other kernel may not.
+FLOAT64 = {
+    "gaussians.projection._project": "the determinant and the conic's quotients (conventions.md)",
+    "gaussians.projection._threshold": "the logarithm of the threshold, rounded up once",
+    "gaussians.footprints": "binning is geometry in float64, conservative by a stated bound",
+    "gaussians.tiling._row_ranges": "same",
+    "gaussians.tiling._row_entries": "same",
+    "gaussians.tiling._column_span": "same",
+    "gaussians.synthetic": "scenes are generated in float64 and rounded once",
+    "lod_cloud.criterion._count_violations": "places the proof's cameras, then rounds them",
+    "lod_cloud.merge": "parents are merged in float64 and rounded once (sizes up)",
+}
+# Of these, where float32 matters beside float64: the float64 variables by name.
+NAMES = {
+    "gaussians.projection._project": {"det", "wide_xx", "wide_xy", "wide_yy"},
+    "lod_cloud.criterion._count_violations": {
+        *("away", "unit", "distance", "length", "shell", "shells"),
+    },
+}
+
+
+def declared(name: str) -> bool:
+    return any(name == entry or name.startswith(f"{entry}.") for entry in FLOAT64)
+
+
+@pytest.fixture(scope="module")
+def kernels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Every kernel of the project, after a run of the main job and of the nesting proof."""
+    scene = scene_options(None, {"city_leaves": 1500, "width": 48, "height": 48})
+    for method in ("exact", "paper", "independent"):
+        options = SimulateOptions(
+            scene=scene,
+            seed=0,
+            frames=2,
+            method=method,
+            tau_px=6.0,
+            search_every=1,
+            accelerator="nebula",
+            rate_mbps=100.0,
+            latency_ms=0.0,
+            baseline_m=0.06,
+            out=tmp_path_factory.mktemp("out"),
+            html=False,
+        )
+        simulate.run(options)
+    prove_nesting(build_tree(generate_city(1500, 0).scene))
+    return project_kernels()
+
+
+@pytest.fixture(scope="module")
+def found(kernels: dict[str, Any]) -> dict[str, dict[str, str]]:
+    """float64 variables of every kernel that declares none, or declares them by name.
+
+    Compiling a caller anew gives its callees their signatures, so callees are looked at last.
+    """
+    open_ones = {
+        n: k for n, k in kernels.items() if n in NAMES or not (declared(n) or is_inlined(k))
+    }
+    variables: dict[str, dict[str, str]] = {}
+    while ready := [n for n, k in open_ones.items() if n not in variables and k.signatures]:
+        variables |= {name: float64_variables(open_ones[name]) for name in ready}
+    assert set(open_ones) - set(variables) == set(), "kernels that the run above does not call"
+    return variables
+
+
+def test_float64_stands_only_where_it_is_declared(found: dict[str, dict[str, str]]) -> None:
+    assert len(found) >= 10
+    assert {n: variables for n, variables in found.items() if variables and n not in NAMES} == {}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_declared_float64_has_these_names(found: dict[str, dict[str, str]], name: str) -> None:
+    assert {v for v in found[name] if not v.startswith("line ")} == NAMES[name]
+
+
+def test_what_is_declared_exists(kernels: dict[str, Any]) -> None:
+    for entry in FLOAT64:
+        assert any(name == entry or name.startswith(f"{entry}.") for name in kernels), entry
