@@ -207,6 +207,7 @@ class PositionField:
         valid: Mask = np.all(np.abs(tile) <= _TILE_LIMIT, axis=1)
         tile = np.where(valid[:, None], tile, 0.0)
         offset = np.floor((np.where(valid[:, None], scaled, 0.0) - tile) * (TOP + 1))
+        offset = np.minimum(offset, TOP)  # just below 0, the difference rounds up to a whole tile
         return tile.astype(np.int16), offset.astype(np.uint16), valid
 
     def decode(self, tile: NDArray[np.int16], offset: UInt16) -> Float32:

@@ -1,0 +1,86 @@
+"""Some nodes of a tree with all a client must know of them, decoded or not yet coded."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gaussians.scene import FIELDS, Scene
+from lod_cloud.lod_tree import Float32, Int32, LodTree
+from lod_cloud.protocol import RemoteProtocolError
+
+
+@dataclass(frozen=True)
+class NodeRecords:
+    """What a client must know of some nodes: Gaussian, node sphere, place in the tree."""
+
+    ids: Int32  # [N] ascending
+    parents: Int32  # [N], -1 for the root
+    child_counts: Int32  # [N], 0 for leaves
+    radius: Float32  # [N], 0 for leaves
+    extent: Float32  # [N], 0 for leaves
+    gaussians: Scene  # [N]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @classmethod
+    def of(cls, tree: LodTree, ids: Int32) -> NodeRecords:
+        """The nodes ``ids`` (ascending) of a tree."""
+        counts = tree.child_count[ids]
+        inner = (counts > 0).astype(np.float32)
+        radius, extent = tree.radius[ids] * inner, tree.extent[ids] * inner
+        return cls(ids, tree.parent[ids], counts, radius, extent, tree.gaussians.take(ids))
+
+    def check(self) -> NodeRecords:
+        """Return self, or raise RemoteProtocolError unless ids and parents are those of a tree."""
+        ids, parents = self.ids.astype(np.int64), self.parents.astype(np.int64)
+        if (ids < 0).any() or (np.diff(ids) <= 0).any() or (np.diff(parents) < 0).any():
+            raise RemoteProtocolError("node ids must be >= 0 and ascend, their parents not descend")
+        if (parents < -1).any() or (parents >= ids).any():
+            raise RemoteProtocolError("a parent must have a smaller id than its child")
+        return self
+
+    def float32_rows(self, rows: NDArray[np.integer]) -> Float32:
+        """[rows, `row_width`] everything but the place in the tree, exact."""
+        gaussians = self.gaussians.take(rows)
+        spheres = np.stack([self.radius[rows], self.extent[rows]], axis=1)
+        return np.hstack([spheres, *(_flat(getattr(gaussians, f)) for f in FIELDS)])
+
+
+def row_width(sh_degree: int) -> int:
+    """Numbers in a row of `float32_rows`: R, e, mean, rotation, scales, opacity, harmonics."""
+    return 2 + 11 + 3 * (sh_degree + 1) ** 2
+
+
+def with_rows(
+    structure: tuple[Int32, Int32, Int32],
+    spheres: Float32,
+    gaussians: Scene,
+    rows: Int32,
+    values: Float32,
+) -> NodeRecords:
+    """Records with ``values`` [rows, width] at ``rows`` and the others, in order, from the rest.
+
+    ``structure`` is ids, parents, child counts of all nodes; ``spheres`` [others, 2] and
+    ``gaussians`` [others] belong to the nodes not in ``rows``.
+    """
+    others = np.ones(len(structure[0]), np.bool_)
+    others[rows] = False
+    table = np.empty((len(others), values.shape[1]), np.float32)
+    table[others] = np.hstack([spheres, *(_flat(getattr(gaussians, f)) for f in FIELDS)])
+    table[rows] = values
+    parts = (table[:, 2:5], table[:, 5:9], table[:, 9:12], table[:, 12], table[:, 13:])
+    arrays = [np.ascontiguousarray(p) for p in parts]
+    arrays[4] = arrays[4].reshape(len(table), (values.shape[1] - 13) // 3, 3)
+    spheres = np.ascontiguousarray(table[:, :2].T)
+    return NodeRecords(*structure, spheres[0], spheres[1], Scene(*arrays))
+
+
+def _flat(array: NDArray[Any]) -> NDArray[Any]:
+    """[N, everything else]; also for N = 0."""
+    return array.reshape(len(array), math.prod(array.shape[1:]))

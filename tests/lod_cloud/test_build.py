@@ -1,0 +1,212 @@
+"""The tree: structure, merge, node spheres, nesting."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gaussians import parallel
+from gaussians.errors import InputError
+from gaussians.scene import FIELDS, Scene
+from lod_cloud.build import build_tree
+from lod_cloud.criterion import SearchRequest, prove_nesting
+from lod_cloud.lod_tree import LodTree
+from lod_cloud.merge import merge_nodes
+from tests.lod_cloud.trees import random_scene, random_tree
+from tests.naive import lod_merge as naive
+
+
+def leaves_below(tree: LodTree) -> set[frozenset[int]]:
+    below: list[set[int]] = [set() for _ in range(len(tree))]
+    for node in range(len(tree) - 1, -1, -1):
+        if tree.leaf_id[node] >= 0:
+            below[node].add(int(tree.leaf_id[node]))
+        if node:
+            below[tree.parent[node]] |= below[node]
+    return {frozenset(b) for b in below}
+
+
+@pytest.mark.nojit
+@given(st.integers(1, 80), st.integers(0, 9999))
+@settings(max_examples=40, deadline=None)
+def test_structure_equals_naive(count: int, seed: int) -> None:
+    scene = random_scene(count, seed)
+    tree = build_tree(scene).validate()
+    assert len(tree) == 2 * count - 1
+    assert leaves_below(tree) == naive.leaf_sets(scene, list(range(count)))
+
+
+@pytest.mark.nojit
+@given(st.integers(2, 40), st.integers(0, 9999))
+@settings(max_examples=40, deadline=None)
+def test_interior_nodes_are_the_merge_of_their_children(count: int, seed: int) -> None:
+    tree = build_tree(random_scene(count, seed))
+    g = tree.gaussians
+    for node in np.flatnonzero(tree.child_count):
+        first = tree.first_child[node]
+        wanted = naive.merge(g.take(np.arange(first, first + tree.child_count[node])))
+        size = max(np.sqrt(np.trace(wanted.covariance)), 1e-6)
+        assert np.allclose(g.means[node], wanted.mean, rtol=1e-6, atol=1e-6)
+        ours = naive.covariance(g.quaternions[node], g.scales[node])
+        assert np.abs(ours - wanted.covariance).max() < 2e-6 * size * size
+        assert g.sh[node] == pytest.approx(wanted.sh, rel=1e-5, abs=1e-6)
+        # the surface of a line or a point is rounding noise, and so is its opacity
+        if naive.surface(g.scales[node]) > 1e-5 * size * size:
+            assert g.opacities[node] == pytest.approx(wanted.opacity, rel=1e-3)
+
+
+def test_leaves_are_the_input_bit_for_bit() -> None:
+    scene = random_scene(777, 3, sh_degree=3)
+    tree = build_tree(scene)
+    leaves = tree.gaussians.take(tree.leaf_nodes())
+    for name in FIELDS:
+        assert getattr(leaves, name).tobytes() == getattr(scene, name).tobytes()
+
+
+def test_node_spheres_follow_the_definition() -> None:
+    tree = random_tree(200, 5)
+    g = tree.gaussians
+    margin = 1 + 2.0**-19
+    for node in range(len(tree)):
+        variances = np.diag(naive.covariance(g.quaternions[node], g.scales[node]))
+        radius, extent = 3 * np.sqrt(variances.sum()), 6 * np.sqrt(variances.max())
+        for child in np.flatnonzero(tree.parent == node):
+            gap = np.linalg.norm(g.means[child].astype(float) - g.means[node].astype(float))
+            radius = max(radius, (float(tree.radius[child]) + gap) * margin)
+            extent = max(extent, float(tree.extent[child]) * margin)
+        # rounded up, by one float32 step at most
+        for ours, wanted in ((tree.radius[node], radius), (tree.extent[node], extent)):
+            assert wanted * (1 - 1e-13) <= ours <= wanted * (1 + 2.0**-22)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_tiny_scenes(count: int) -> None:
+    tree = random_tree(count, 1).validate()
+    assert (tree.leaves, len(tree)) == (count, 2 * count - 1)
+    assert prove_nesting(tree) == 0
+
+
+def point_scene(scales: float, opacities: list[float], spread: float = 1.0) -> Scene:
+    count = len(opacities)
+    means = np.zeros((count, 3), np.float32)
+    means[:, 0] = spread * np.arange(count)
+    quaternions = np.zeros((count, 4), np.float32)
+    quaternions[:, 0] = 1
+    size = np.full((count, 3), scales, np.float32)
+    return Scene(
+        means,
+        quaternions,
+        size,
+        np.array(opacities, np.float32),
+        np.ones((count, 1, 3), np.float32),
+    )
+
+
+def test_children_without_weight_get_equal_weights() -> None:
+    for scales, opacities in ((0.0, [0.25, 0.75]), (0.1, [0.0, 0.0])):
+        root = build_tree(point_scene(scales, opacities)).gaussians.take(np.array([0]))
+        root.validate()
+        assert root.means[0].tolist() == [0.5, 0.0, 0.0]
+        assert root.opacities[0] == np.float32(np.mean(opacities))
+        assert np.sort(root.scales[0])[2] == pytest.approx(np.hypot(scales, 0.5))
+
+
+def test_points_on_one_spot_merge_to_a_point() -> None:
+    root = build_tree(point_scene(0.0, [0.5] * 5, spread=0.0)).gaussians
+    assert root.scales[0].tolist() == [0.0, 0.0, 0.0]
+    assert root.opacities[0] == np.float32(0.5)
+
+
+def test_equal_splats_on_one_spot_add_up_beyond_one() -> None:
+    tree = build_tree(point_scene(0.1, [0.75] * 8, spread=0.0))
+    assert tree.gaussians.opacities[0] == pytest.approx(6.0)
+
+
+def test_needles_keep_their_thin_axis() -> None:
+    scene = point_scene(0.0, [0.5, 0.5], spread=0.0)
+    scene.scales[:] = (100.0, 1e-4, 1e-5)
+    turn = np.array([0.8, 0.36, 0.48, 0.0], np.float32)
+    scene.quaternions[:] = turn / np.linalg.norm(turn)
+    root = np.sort(build_tree(scene).gaussians.scales[0].astype(float))
+    assert root[2] == pytest.approx(100.0, rel=1e-6)
+    assert root[:2].max() < 1e-3  # eigenvalues are exact to 1e-16 of the largest one
+
+
+def test_no_number_of_threads_changes_a_bit() -> None:
+    scene = random_scene(5000, 11)
+    before = parallel.threads()
+    try:
+        trees = []
+        for count in (1, 3):
+            parallel.set_threads(count)
+            trees.append(build_tree(scene))
+    finally:
+        parallel.set_threads(before)
+    for name in ("parent", "leaf_id", "radius", "extent"):
+        assert np.array_equal(getattr(trees[0], name), getattr(trees[1], name))
+    for name in FIELDS:
+        assert np.array_equal(*(getattr(t.gaussians, name) for t in trees))
+
+
+@given(st.integers(2, 300), st.integers(0, 9999), st.sampled_from([0.01, 10.0, 3000.0]))
+@settings(max_examples=25, deadline=None)
+def test_nesting_holds_everywhere(count: int, seed: int, size_m: float) -> None:
+    assert prove_nesting(random_tree(count, seed, size_m=size_m)) == 0
+
+
+def test_nesting_breaks_without_the_margin() -> None:
+    """Rounding up alone is not enough: the float32 node test rounds as well."""
+    tree = random_tree(20_000, 7)
+    radius, extent = np.zeros_like(tree.radius), np.zeros_like(tree.extent)
+    offsets = tree.level_offsets
+    merge_nodes(tree.gaussians, tree.first_child, tree.child_count, offsets, radius, extent, 1.0)
+    assert prove_nesting(tree) == 0
+    assert prove_nesting(dataclasses.replace(tree, radius=radius, extent=extent)) > 100
+
+
+def test_bad_input_is_refused() -> None:
+    scene = random_scene(4, 0)
+    with pytest.raises(InputError, match="the scene is empty"):
+        build_tree(scene.take(np.arange(0)))
+    scene.means[2, 1] = np.nan
+    with pytest.raises(InputError, match="means must be finite"):
+        build_tree(scene)
+    scene.means[2, 1] = 1e13
+    with pytest.raises(InputError, match="within 1e\\+12 m"):
+        build_tree(scene)
+    dense = point_scene(0.1, [1e6, 1e6], spread=0.0)
+    with pytest.raises(InputError, match="merged opacities must not exceed"):
+        build_tree(dense)
+
+
+@pytest.mark.parametrize(
+    ("position", "focal", "tau", "message"),
+    [
+        ((0, 0, np.nan), 900, 6, "position must be three numbers"),
+        ((0, 0, 1e300), 900, 6, "position must be three numbers"),
+        ((0, 0), 900, 6, "position must be three numbers"),
+        ((0, 0, 0), 0, 6, "focal length must lie in"),
+        ((0, 0, 0), np.inf, 6, "focal length must lie in"),
+        ((0, 0, 0), 900, -1, "tau must be a finite number"),
+        ((0, 0, 0), 900, np.inf, "tau must be a finite number"),
+    ],
+)
+def test_requests_are_checked(position: tuple, focal: float, tau: float, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        SearchRequest(position, focal, tau)
+
+
+def test_validate_names_the_broken_rule() -> None:
+    tree = random_tree(9, 2)
+    parent = tree.parent.copy()
+    parent[5] = 7
+    with pytest.raises(InputError, match="smaller number than its child"):
+        dataclasses.replace(tree, parent=parent).validate()
+    leaf_id = tree.leaf_id.copy()
+    leaf_id[leaf_id == 3] = 4
+    with pytest.raises(InputError, match="leaf_id must number the leaves"):
+        dataclasses.replace(tree, leaf_id=leaf_id).validate()

@@ -1,0 +1,80 @@
+"""The tree build written from its definition: recursive, dense matrices, numpy eigenvalues."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gaussians.scene import Scene
+
+Float64 = NDArray[np.float64]
+
+
+def leaf_order(scene: Scene, ids: list[int]) -> list[int]:
+    """Ids from left to right: split at the median of the longest axis, equal coordinates by id."""
+    if len(ids) == 1:
+        return ids
+    points = scene.means[ids]
+    axis = int(np.argmax(points.max(axis=0) - points.min(axis=0)))
+    ordered = sorted(ids, key=lambda i: (float(scene.means[i, axis]), i))
+    half = len(ids) // 2
+    return leaf_order(scene, ordered[:half]) + leaf_order(scene, ordered[half:])
+
+
+def leaf_sets(scene: Scene, ids: list[int]) -> set[frozenset[int]]:
+    """The leaves below every node of the tree."""
+    if len(ids) == 1:
+        return {frozenset(ids)}
+    ordered = leaf_order(scene, ids)
+    half = len(ids) // 2
+    left, right = leaf_sets(scene, ordered[:half]), leaf_sets(scene, ordered[half:])
+    return {frozenset(ids)} | left | right
+
+
+@dataclass(frozen=True)
+class Merged:
+    mean: Float64
+    covariance: Float64
+    opacity: float
+    sh: Float64
+
+
+def covariance(quaternion: NDArray[np.float32], scales: NDArray[np.float32]) -> Float64:
+    w, x, y, z = quaternion.astype(np.float64) / np.linalg.norm(quaternion.astype(np.float64))
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    half = rotation @ np.diag(scales.astype(np.float64))
+    return half @ half.T
+
+
+def surface(s: NDArray[np.floating]) -> float:
+    a, b, c = (float(v) for v in s)
+    return a * b + a * c + b * c
+
+
+def merge(children: Scene) -> Merged:
+    """Opacity x surface weights; plain means where there is no weight."""
+    surfaces = np.array([surface(s) for s in children.scales])
+    opacities = children.opacities.astype(np.float64)
+    total = float((opacities * surfaces).sum())
+    weights = (
+        opacities * surfaces / total if total > 0 else np.full(len(children), 1 / len(children))
+    )
+    mean = weights @ children.means.astype(np.float64)
+    spread = np.zeros((3, 3))
+    for w, q, s, m in zip(
+        weights, children.quaternions, children.scales, children.means, strict=True
+    ):
+        spread += w * (covariance(q, s) + np.outer(m - mean, m - mean))
+    merged_surface = surface(np.sqrt(np.maximum(np.linalg.eigvalsh(spread), 0)))
+    opacity = float(weights @ opacities)
+    if total > 0 and merged_surface > 0:
+        opacity = total / merged_surface
+    return Merged(mean, spread, opacity, np.tensordot(weights, children.sh.astype(np.float64), 1))
