@@ -294,6 +294,11 @@ class Codebook:
         return self.stages[0].shape[1]
 
     @property
+    def index_type(self) -> type[np.unsignedinteger]:
+        """The narrowest type that numbers the words of every stage."""
+        return np.uint8 if max(len(book) for book in self.stages) <= 256 else np.uint16
+
+    @property
     def size_bytes(self) -> int:
         """Bytes of all words."""
         return sum(book.nbytes for book in self.stages)
@@ -373,12 +378,3 @@ def _nearest_range(begin: int, end: int, vectors: Float64, book: Float64, best: 
         if len(close):
             first[close] = (norms - 2 * (rows[close] @ book.T)).argmin(axis=1)
         best[low : low + len(rows)] = first
-
-
-def record_bytes(sh_degree: int, stages: int) -> float:
-    """Bytes of one coded Gaussian before entropy coding, without tile, ids and node sphere.
-
-    Position, scales and DC colour 3 x 2, rotation 3 x 2 and 2 bits, opacity 2, 2 per codebook
-    stage.
-    """
-    return 26.25 + (2.0 * stages if sh_degree else 0.0)

@@ -5,8 +5,8 @@ conventions.md. ``square_3sigma``: INRIA's square of radius ceil(3 sigma_max). `
 oriented box of three sigmas. The last two drop contributions that the ellipse keeps: an opacity of
 1 reaches 1/255 only at 3.33 sigma. Arithmetic is float64 on the float32 conic and covariance.
 
-A footprint is prepared once per splat and eye into a shape record, whose columns depend on the
-rule. Called from kernels in other files; see kernel_cache.py.
+A footprint is prepared once per splat and eye into six numbers, whose meaning depends on the rule.
+Called from kernels in other files; see kernel_cache.py.
 """
 
 from __future__ import annotations
@@ -21,12 +21,11 @@ from numpy.typing import NDArray
 from gaussians.constants import CONIC_A, CONIC_B, CONIC_C, THRESHOLD
 
 Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 Intersection = Literal["ellipse", "square_3sigma", "obb"]
 INTERSECTIONS: tuple[str, ...] = get_args(Intersection)
 ELLIPSE, SQUARE, BOX = range(3)
 
-SHAPE_COLUMNS = 6
+Shape = tuple[float, float, float, float, float, float]
 _SLOPE, _INVERSE, _REACH, _DET, _TOP, _WIDEST = range(6)  # ellipse
 _RADIUS = 0  # square
 _X1, _Y1, _X2, _Y2 = range(4)  # box: half axes (x1, y1) and (x2, y2)
@@ -38,7 +37,7 @@ _EMPTY = (1.0, -1.0)
 
 
 @njit(cache=True, error_model="numpy")
-def _prepare_ellipse(feature: Float32, shape: Float64) -> float:
+def _ellipse(feature: Float32) -> tuple[float, Shape]:
     """With a, c widened by the rounding bound and q = -threshold, the boundary over dy is
     (-b dy -+ sqrt(2 q a - det dy^2)) / a; it is widest to the right at dy = WIDEST."""
     a = np.float64(feature[CONIC_A]) * (1.0 - _ROUNDING)
@@ -46,46 +45,43 @@ def _prepare_ellipse(feature: Float32, shape: Float64) -> float:
     c = np.float64(feature[CONIC_C]) * (1.0 - _ROUNDING)
     two_q = -2.0 * np.float64(feature[THRESHOLD])
     det = a * c - b * b
-    shape[_SLOPE], shape[_INVERSE] = -b / a, 1.0 / a
-    shape[_REACH], shape[_DET] = two_q * a, det
+    top, widest = np.inf, 0.0
     if two_q < 0.0:
-        shape[_TOP] = -1.0
+        top = -1.0
     elif det > 0.0:
-        shape[_TOP] = math.sqrt(two_q * a / det)
-        shape[_WIDEST] = -b * math.sqrt(two_q / (c * det))
-    else:
-        shape[_TOP] = np.inf
-    return shape[_TOP]
+        top = math.sqrt(two_q * a / det)
+        widest = -b * math.sqrt(two_q / (c * det))
+    return top, (-b / a, 1.0 / a, two_q * a, det, top, widest)
 
 
 @njit(cache=True, error_model="numpy")
-def prepare_footprint(rule: int, feature: Float32, covariance: Float32, shape: Float64) -> float:
-    """Fill the shape record; its half height in px: negative if empty, infinite if unbounded.
+def footprint(rule: int, feature: Float32, covariance: Float32) -> tuple[float, Shape]:
+    """Half height in px, negative if empty and infinite if unbounded, and the shape.
 
     An ellipse is unbounded where rounding leaves it so (condition number about 1e6 and above).
     """
     if rule == ELLIPSE:
-        return _prepare_ellipse(feature, shape)
+        return _ellipse(feature)
     cxx, cxy = np.float64(covariance[0]), np.float64(covariance[1])
     cyy = np.float64(covariance[2])
     middle = 0.5 * (cxx + cyy)
     square_root_of = middle * middle - (cxx * cyy - cxy * cxy)
     if rule == SQUARE:  # INRIA's floor of 0.1 under the root
         largest = middle + math.sqrt(max(0.1, square_root_of))
-        shape[_RADIUS] = np.ceil(_SIGMAS * math.sqrt(largest))
-        return shape[_RADIUS]
+        radius = np.ceil(_SIGMAS * math.sqrt(largest))
+        return radius, (radius, 0.0, 0.0, 0.0, 0.0, 0.0)
     spread = math.sqrt(max(0.0, square_root_of))
     angle = 0.5 * math.atan2(2.0 * cxy, cxx - cyy)
     long_axis = _SIGMAS * math.sqrt(middle + spread)
     short_axis = _SIGMAS * math.sqrt(max(0.0, middle - spread))
     cosine, sine = math.cos(angle), math.sin(angle)
-    shape[_X1], shape[_Y1] = long_axis * cosine, long_axis * sine
-    shape[_X2], shape[_Y2] = -short_axis * sine, short_axis * cosine
-    return abs(shape[_Y1]) + abs(shape[_Y2])
+    x1, y1 = long_axis * cosine, long_axis * sine
+    x2, y2 = -short_axis * sine, short_axis * cosine
+    return abs(y1) + abs(y2), (x1, y1, x2, y2, 0.0, 0.0)
 
 
 @njit(cache=True, error_model="numpy")
-def _ellipse_interval(shape: Float64, low: float, high: float) -> tuple[float, float]:
+def _ellipse_interval(shape: Shape, low: float, high: float) -> tuple[float, float]:
     top = shape[_TOP]
     low, high = max(low, -top), min(high, top)
     if low > high:
@@ -105,7 +101,7 @@ def _ellipse_interval(shape: Float64, low: float, high: float) -> tuple[float, f
 
 
 @njit(cache=True, error_model="numpy")
-def _box_interval(shape: Float64, low: float, high: float) -> tuple[float, float]:
+def _box_interval(shape: Shape, low: float, high: float) -> tuple[float, float]:
     """Corners inside the slab, and edges cut by its two lines."""
     x1, y1, x2, y2 = shape[_X1], shape[_Y1], shape[_X2], shape[_Y2]
     left, right = _FAR_PX, -_FAR_PX
@@ -127,7 +123,7 @@ def _box_interval(shape: Float64, low: float, high: float) -> tuple[float, float
 
 
 @njit(cache=True, error_model="numpy")
-def footprint_interval(rule: int, shape: Float64, low: float, high: float) -> tuple[float, float]:
+def footprint_interval(rule: int, shape: Shape, low: float, high: float) -> tuple[float, float]:
     """x interval, relative to the centre, of the footprint over dy in [low, high].
 
     Empty: left > right.

@@ -20,16 +20,15 @@ from gaussians.errors import InputError
 from gaussians.footprints import (
     ELLIPSE,
     INTERSECTIONS,
-    SHAPE_COLUMNS,
     Intersection,
+    Shape,
+    footprint,
     footprint_interval,
-    prepare_footprint,
 )
 from gaussians.parallel import run_chunks
 from gaussians.projection import ProjectedSplats
 
 Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 _SLACK_PX = 1e-3  # far above the rounding of the float64 span arithmetic itself (< 1e-6 px)
 _BLOCK = 4096  # splats per unit of parallel work; rows are filled block by block in depth order
 
@@ -84,19 +83,17 @@ class RowSpans:
 
 
 class _Job(NamedTuple):
-    """What the binning kernels read."""
+    """How to bin. Holds no arrays: passing those on counts references in every call."""
 
     rule: int
     tile: int
     shift: int  # log2 of tile
     width: int
     height: int
-    features: Float32  # [eyes, M, 10]
-    covariances: Float32  # [eyes, M, 3]
 
 
 @njit(cache=True, error_model="numpy")
-def _column_span(job: _Job, u: float, v: float, shape: Float64, row: int) -> tuple[int, int]:
+def _column_span(job: _Job, u: float, v: float, shape: Shape, row: int) -> tuple[int, int]:
     """First and last tile column of a splat in a tile row; first > last when it touches none.
 
     An ellipse must meet a pixel centre of the tile, square and box any of its area.
@@ -123,20 +120,25 @@ def _column_span(job: _Job, u: float, v: float, shape: Float64, row: int) -> tup
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _row_ranges(
-    begin: int, end: int, job: _Job, rows: NDArray[np.int32], block_counts: NDArray[np.int64]
+    begin: int,
+    end: int,
+    job: _Job,
+    features: Float32,
+    covariances: Float32,
+    rows: NDArray[np.int32],
+    block_counts: NDArray[np.int64],
 ) -> int:
     """rows [M, 2]: first and last tile row, the union over eyes; returns the unbounded splats."""
-    shape = np.empty(SHAPE_COLUMNS, np.float64)
     unbounded = 0
     for block in range(begin, end):
         for rank in range(block * _BLOCK, min((block + 1) * _BLOCK, rows.shape[0])):
             half = -1.0
-            for eye in range(job.features.shape[0]):
-                feature, covariance = job.features[eye, rank], job.covariances[eye, rank]
-                half = max(half, prepare_footprint(job.rule, feature, covariance, shape))
+            for eye in range(features.shape[0]):
+                extent, _shape = footprint(job.rule, features[eye, rank], covariances[eye, rank])
+                half = max(half, extent)
             if half == np.inf:
                 unbounded += 1
-            v = np.float64(job.features[0, rank, V])
+            v = np.float64(features[0, rank, V])
             low = max(v - half - 0.5 - _SLACK_PX, -1.0)
             high = min(v + half - 0.5 + _SLACK_PX, np.float64(job.height))
             if job.rule == ELLIPSE:  # only rows of pixel centres count
@@ -158,19 +160,20 @@ def _row_entries(
     begin: int,
     end: int,
     job: _Job,
+    features: Float32,
+    covariances: Float32,
     rows: NDArray[np.int32],
     cursors: NDArray[np.int64],
     ranks: NDArray[np.int32],
     spans: NDArray[np.int16],
 ) -> None:
     """Splat by splat, so that a splat's numbers are read once for all its rows and both eyes."""
-    shape = np.empty(SHAPE_COLUMNS, np.float64)
     for block in range(begin, end):
         for rank in range(block * _BLOCK, min((block + 1) * _BLOCK, rows.shape[0])):
-            for eye in range(job.features.shape[0]):
-                feature = job.features[eye, rank]
+            for eye in range(features.shape[0]):
+                feature = features[eye, rank]
                 u, v = np.float64(feature[U]), np.float64(feature[V])
-                prepare_footprint(job.rule, feature, job.covariances[eye, rank], shape)
+                _half, shape = footprint(job.rule, feature, covariances[eye, rank])
                 for row in range(rows[rank, 0], rows[rank, 1] + 1):
                     entry = cursors[block, row]
                     first, last = _column_span(job, u, v, shape, row)
@@ -238,18 +241,17 @@ def row_spans(
         shift=grid.tile_px.bit_length() - 1,
         width=grid.width,
         height=grid.height,
-        features=splats.features,
-        covariances=splats.covariances,
     )
+    arrays = (splats.features, splats.covariances)
     rows = np.empty((len(splats.ids), 2), np.int32)
     blocks = -(-len(rows) // _BLOCK)
     block_counts = np.zeros((blocks, grid.tiles_y), np.int64)
-    unbounded = run_chunks(_row_ranges, blocks, job, rows, block_counts)
+    unbounded = run_chunks(_row_ranges, blocks, job, *arrays, rows, block_counts)
     offsets = offsets_of(block_counts.sum(axis=0))
     cursors = offsets[:-1] + np.cumsum(block_counts, axis=0) - block_counts
     ranks = np.empty(offsets[-1], np.int32)
     spans = np.empty((splats.eyes, len(ranks), 2), np.int16)
-    run_chunks(_row_entries, blocks, job, rows, cursors, ranks, spans)
+    run_chunks(_row_entries, blocks, job, *arrays, rows, cursors, ranks, spans)
     counts = np.empty((splats.eyes, grid.tiles_y, grid.tiles_x), np.int32)
     run_chunks(_count_tiles, grid.tiles_y, offsets, spans, counts)
     return RowSpans(grid, offsets, ranks, spans, counts, sum(unbounded))

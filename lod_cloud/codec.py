@@ -182,8 +182,10 @@ class PaperCodec:
         writer.plain(nodes.child_counts.astype(np.uint16))
         writer.differences(escaped)
         writer.differences(tile[valid])
-        for codes in (offset, scale, rotation, opacity, dc, words):
+        for codes in (offset, scale, rotation, opacity, dc):
             writer.plain(codes[valid])
+        if self.codebook:
+            writer.plain(words[valid].astype(self.codebook.index_type))
         writer.raw(_packed_pairs(largest[valid]))
         writer.plain(radius[inner])
         writer.plain(extent[inner])
@@ -217,7 +219,9 @@ class PaperCodec:
         offset, scale, rotation = (reader.plain(np.uint16, count, 3) for _ in range(3))
         opacity = reader.plain(np.uint16, count)
         dc = reader.plain(np.uint16, count, 3)
-        words = reader.plain(np.uint16, count, stages).reshape(count, stages)
+        words = np.empty((count, 0), np.uint16)
+        if self.codebook:
+            words = reader.plain(self.codebook.index_type, count, stages).reshape(count, stages)
         largest = _unpacked_pairs(reader.raw((count + 3) // 4), count)
         sh = np.empty((count, (self.sh_degree + 1) ** 2, 3), np.float32)
         sh[:, 0] = self.dc.decode(dc)

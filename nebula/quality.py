@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gaussians.cameras import StereoRig
+from gaussians.parallel import threads
 from gaussians.quality import MissingQualityExtra, psnr_db, ssim
 from gaussians.render import render_mono
 from gaussians.scene import Scene
@@ -43,10 +45,14 @@ class QualityComparison:
         for pair, (a, b) in zip(PAIRS, images, strict=True):
             psnr = psnr_db(a, b)
             self._errors[pair].append(0.0 if psnr is None else 10.0 ** (-psnr / 10.0))
-            try:
-                self._ssims[pair].append(ssim(a, b))
-            except MissingQualityExtra as error:
-                self._missing = [f"SSIM was not computed: {error}"]
+        try:
+            with ThreadPoolExecutor(threads()) as pool:  # the filters release the GIL
+                values = list(pool.map(lambda pair: ssim(*pair), images))
+        except MissingQualityExtra as error:
+            self._missing = [f"SSIM was not computed: {error}"]
+            return
+        for pair, value in zip(PAIRS, values, strict=True):
+            self._ssims[pair].append(value)
 
     def result(self) -> tuple[dict[str, Any], list[str]]:
         """The report's group, means over the compared frames, and what could not be computed."""

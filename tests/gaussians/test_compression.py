@@ -249,9 +249,3 @@ def test_codebook_sizes_and_outliers() -> None:
         c.Codebook.train(vectors[4:5], words=4, stages=1, seed=1)
     with pytest.raises(InputError, match=r"1\.\.65536 words"):
         c.Codebook.train(vectors, words=0, stages=1, seed=1)
-
-
-def test_record_bytes() -> None:
-    """28 B and a quarter: the paper's 14 numbers of 16 bit, and the 2-bit index of the rotation."""
-    assert c.record_bytes(3, 1) == 28.25
-    assert c.record_bytes(0, 1) == 26.25
