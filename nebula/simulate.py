@@ -214,8 +214,8 @@ def _provenance(options: SimulateOptions, setting: _Setting, clock: _Clock) -> d
             "near_m": place.placement.near_m,
             "level": scene.level,
             "trace": setting.trace.name,
-            **{f"display_{key}": value for key, value in assemble.plain(scene.display).items()},
         },
+        "display": assemble.plain(scene.display),
         "options": {
             key: assemble.plain(value)
             for key, value in vars(options).items()

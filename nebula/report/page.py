@@ -56,6 +56,7 @@ def _header(report: Mapping[str, Any]) -> str:
     scene, run = report["scene"], report["provenance"]
     what = (
         f"{exact(scene['leaves'])} Gaussians · {len(report['frames'])} frames · "
+        f"{run['display']['width']} × {run['display']['height']} px per eye · "
         f"stereo method {report['stereo']['method']} · "
         f"accelerator {report['timing']['accelerator']}"
     )

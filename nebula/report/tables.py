@@ -55,6 +55,7 @@ def provenance(report: Mapping[str, Any]) -> str:
         ("scene", f"{scene['name']} ({scene['origin']}), SH degree {scene['sh_degree']}"),
         ("bounds, m", f"{plain(scene['bounds_min_m'])} to {plain(scene['bounds_max_m'])}"),
         *((name, plain(value)) for name, value in run["placement"].items()),
+        *((f"display {name}", plain(value)) for name, value in run["display"].items()),
         ("seed", str(run["seed"])),
         *((name, plain(value)) for name, value in run["options"].items()),
     ]

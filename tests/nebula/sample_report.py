@@ -104,11 +104,19 @@ def _provenance() -> dict[str, Any]:
                 "units_per_metre": 1.0,
                 "view": [[2.0, -30.0, 1.7], [2.0, 0.0, 1.7]],
                 "near_m": 0.2,
-                "fov_deg": 96.0,
                 "level": 0,
                 "trace": "walk",
             },
-            "options": {"width": 1024, "height": 1024, "tau_px": 6.0, "baseline_m": 0.06},
+            "display": {
+                "width": 1024,
+                "height": 1024,
+                "fx": 461.0,
+                "fy": 461.0,
+                "cx_left": 512.0,
+                "cx_right": 512.0,
+                "cy": 512.0,
+            },
+            "options": {"tau_px": 6.0, "baseline_m": 0.06},
             "inputs": [{"name": "walk <b>.csv", "bytes": 1_352_211, "sha256": "5f" * 32}],
         }
     }
