@@ -134,7 +134,8 @@ def test_every_key_is_required(key: Any) -> None:
 def test_the_stable_part_leaves_out_machine_and_times_only() -> None:
     stable = stable_part(sample_report())
     assert set(stable["provenance"]) == {
-        *("version", "commit", "machine", "seed", "placement", "options", "inputs", "stage_wall_s")
+        *("version", "commit", "machine", "seed", "placement", "display", "options", "inputs"),
+        "stage_wall_s",
     }
     assert stable["provenance"]["machine"] == {"packages": {}}
     assert stable["provenance"]["stage_wall_s"] == {}
