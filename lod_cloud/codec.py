@@ -31,8 +31,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from gaussians.codebook import Codebook
 from gaussians.compression import (
-    Codebook,
     LinearField,
     LogField,
     PositionField,

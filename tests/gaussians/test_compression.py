@@ -9,10 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # has no stubs
+from threadpoolctl import threadpool_limits
 
 from gaussians import compression as c
 from gaussians import parallel
+from gaussians.codebook import Codebook
 from gaussians.errors import InputError
 from gaussians.scene import normalised_quaternions
 
@@ -190,7 +191,7 @@ def brute_force(book: NDArray[np.float16], vectors: NDArray[np.float64]) -> NDAr
 
 def test_codebook_finds_the_nearest_words() -> None:
     vectors = materials(1, 3000)
-    book = c.Codebook.train(vectors, words=64, stages=2, seed=5)
+    book = Codebook.train(vectors, words=64, stages=2, seed=5)
     codes, valid = book.encode(vectors)
     rest = np.rint(vectors.astype(float) * 2**14) / 2**14
     for stage, words in enumerate(book.stages):
@@ -199,7 +200,7 @@ def test_codebook_finds_the_nearest_words() -> None:
         rest -= words[nearest]
     assert valid.all()
     errors = np.sqrt(((book.decode(codes) - vectors) ** 2).mean())
-    one_stage = c.Codebook(book.stages[:1])
+    one_stage = Codebook(book.stages[:1])
     first = np.sqrt(((one_stage.decode(codes[:, :1]) - vectors) ** 2).mean())
     assert errors < 0.85 * first < 0.5 * vectors.std()
 
@@ -210,7 +211,7 @@ def test_ties_between_words_go_to_the_lower_one() -> None:
     words = np.unique((rng.integers(-8000, 8000, (50, 45)) / 2**13).astype(np.float16), axis=0)
     i, j = rng.integers(0, len(words), (2, 200))
     middles = ((words[i].astype(float) + words[j]) / 2).astype(np.float32)
-    codes = c.Codebook((words,)).encode(middles)[0][:, 0]
+    codes = Codebook((words,)).encode(middles)[0][:, 0]
     on_grid = np.rint(middles.astype(float) * 2**14) / 2**14
     assert np.array_equal(codes, brute_force(words, on_grid))
 
@@ -223,7 +224,7 @@ def test_training_is_reproducible_on_any_number_of_threads() -> None:
         for count in (1, 2):
             parallel.set_threads(count)
             with threadpool_limits(count):
-                books.append(c.Codebook.train(vectors, words=256, stages=2, seed=7))
+                books.append(Codebook.train(vectors, words=256, stages=2, seed=7))
             codes.append(books[-1].encode(vectors)[0])
     finally:
         parallel.set_threads(before)
@@ -231,21 +232,21 @@ def test_training_is_reproducible_on_any_number_of_threads() -> None:
         assert np.array_equal(one, two)
         assert np.array_equal(one.astype(float) * 2**14, np.rint(one.astype(float) * 2**14))
     assert np.array_equal(codes[0], codes[1])
-    other = c.Codebook.train(vectors, words=256, stages=1, seed=8)
+    other = Codebook.train(vectors, words=256, stages=1, seed=8)
     assert not np.array_equal(other.stages[0], books[0].stages[0])
 
 
 def test_codebook_sizes_and_outliers() -> None:
     vectors = materials(3, 100)
-    book = c.Codebook.train(vectors, words=4096, stages=1, seed=1)
+    book = Codebook.train(vectors, words=4096, stages=1, seed=1)
     assert len(book.stages[0]) <= 100 // 8
     assert book.size_bytes == 2 * 9 * len(book.stages[0])
-    assert len(c.Codebook.train(vectors[:1], words=9, stages=1, seed=1).stages[0]) == 1
+    assert len(Codebook.train(vectors[:1], words=9, stages=1, seed=1).stages[0]) == 1
     vectors[4, 2] = 9.0  # beyond AC_RANGE
     vectors[5, 1] = 7.0  # far from every word
     valid = book.encode(vectors)[1]
     assert np.flatnonzero(~valid).tolist() == [4, 5]
     with pytest.raises(InputError, match="needs a vector"):
-        c.Codebook.train(vectors[4:5], words=4, stages=1, seed=1)
+        Codebook.train(vectors[4:5], words=4, stages=1, seed=1)
     with pytest.raises(InputError, match=r"1\.\.65536 words"):
-        c.Codebook.train(vectors, words=0, stages=1, seed=1)
+        Codebook.train(vectors, words=0, stages=1, seed=1)

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gaussians.compression import AC_ERROR, ROTATION_ERROR_RAD
+from gaussians.codebook import AC_ERROR
+from gaussians.compression import ROTATION_ERROR_RAD
 from gaussians.errors import InputError
 from gaussians.scene import FIELDS, Scene
 from lod_cloud.build import build_tree
