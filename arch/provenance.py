@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from gaussians.errors import InputError
@@ -21,6 +21,7 @@ SOURCES = (
 # A: read in the primary text; B: read in a secondary text; C: computed from A and B values;
 # M: from memory or judgement, unverified. Best first.
 CONFIDENCES = ("A", "B", "C", "M")
+_SOURCE_FIELDS = ("source", "reference", "confidence")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,11 +106,8 @@ def sourced_groups(config: object, path: str = "") -> Iterator[SourcedGroup]:
         return
     own = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
     if isinstance(config, Provenance):
-        sources = ("source", "reference", "confidence")
-        values = {
-            k: v for k, v in own.items() if isinstance(v, (int, float, str)) and k not in sources
-        }
-        text = ", ".join(f"{key} {value}" for key, value in values.items())
+        shown = {key: _shown(value) for key, value in own.items() if key not in _SOURCE_FIELDS}
+        text = ", ".join(f"{key} {value}" for key, value in shown.items() if value)
         yield SourcedGroup(path, text, config.source, config.reference, config.confidence)
     elif any(isinstance(value, (int, float)) for value in own.values()):
         raise InputError(f"{path or type(config).__name__}: numbers must carry a source")
@@ -120,6 +118,17 @@ def sourced_groups(config: object, path: str = "") -> Iterator[SourcedGroup]:
                 raise InputError(f"{below}: numbers must carry a source")
             yield from sourced_groups(item, f"{below}[{index}]")
         yield from sourced_groups(value, below)
+
+
+def _shown(value: object) -> str:
+    """A number, a text, numbers in a row, or numbers by name; nothing for anything else."""
+    if isinstance(value, (int, float, str)):
+        return str(value)
+    if isinstance(value, Mapping):
+        return " + ".join(f"{number} {name}" for name, number in value.items())
+    if isinstance(value, tuple) and all(isinstance(item, (int, float)) for item in value):
+        return " ".join(map(str, value))
+    return ""
 
 
 def weakest(*confidences: str) -> str:

@@ -16,6 +16,7 @@ from nebula.session import Session, StartUp
 from nebula.session_config import SessionConfig
 
 EYES = ("left", "right")
+PAPER_RATE_MBPS = 100.0
 
 
 def mean(values: Iterable[float]) -> float:
@@ -197,9 +198,7 @@ def frames(records: Sequence[FrameRecord]) -> list[dict[str, Any]]:
     ]
 
 
-def sources(
-    hardware: Hardware, session: SessionConfig, link: Link, latency_source: str
-) -> list[dict[str, Any]]:
+def sources(hardware: Hardware, session: SessionConfig, link: Link) -> list[dict[str, Any]]:
     """Every number the result rests on, group by group, with where it comes from."""
     configs: Mapping[str, object] = {
         "accelerator": hardware.config,
@@ -217,13 +216,13 @@ def sources(
         for name, config in configs.items()
         for group in sourced_groups(config)
     ]
-    rate = {"name": "link.rate", "value": link.rate_mbps, "unit": "Mbps"}
-    paper = {"source": "paper", "reference": "Sec. 6", "confidence": "A"}
-    assumed = {"source": "assumption", "reference": latency_source, "confidence": "M"}
-    latency = {"name": "link.latency", "value": link.latency_ms, "unit": "ms"}
     given = {"source": "assumption", "reference": "given on the command line", "confidence": "M"}
-    rows.append({**rate, **(paper if link.rate_mbps == 100.0 else given)})
-    rows.append({**latency, **assumed})
+    paper = {"source": "paper", "reference": "Sec. 6", "confidence": "A"}
+    silent = {**given, "reference": "one way, a wireless link at home; the paper gives no value"}
+    rate = {"name": "link.rate", "value": link.rate_mbps, "unit": "Mbps"}
+    latency = {"name": "link.latency", "value": link.latency_ms, "unit": "ms"}
+    rows.append({**rate, **(paper if link.rate_mbps == PAPER_RATE_MBPS else given)})
+    rows.append({**latency, **silent})
     return rows
 
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from arch import CostTable, SourcedGroup, sourced_groups
+from arch import sourced_groups
 from gaussians.errors import InputError
 from nebula.hardware import load_costs
 from nebula.options import EnergyOptions
@@ -19,7 +18,7 @@ from nebula.report import validate_report
 def run(options: EnergyOptions) -> CommandResult:
     """The price list with its sources; with a report, the breakdown of that run as well."""
     costs = load_costs()
-    prices = list(_prices(costs))
+    prices = list(sourced_groups(costs))
     heads = ["price", "values", "source", "conf.", "reference"]
     rows = [[p.path, p.values, p.source, p.confidence, p.reference] for p in prices]
     text = f"prices of {costs.name}\n\n{text_table(heads, rows)}"
@@ -32,18 +31,6 @@ def run(options: EnergyOptions) -> CommandResult:
         data["run"] = read_report(options.report)["energy"]
         text += f"\n\n{_breakdown(data['run'], options.report)}"
     return CommandResult(data, text)
-
-
-def _prices(costs: CostTable) -> Iterator[SourcedGroup]:
-    """Every group of the price list; an action shows the operations it is made of."""
-    operations = {
-        f"actions[{index}]": ", ".join(f"{n:g} {name}" for name, n in action.operations.items())
-        for index, action in enumerate(costs.actions)
-    }
-    for group in sourced_groups(costs):
-        made_of = operations.get(group.path)
-        values = f"{group.values}: {made_of}" if made_of else group.values
-        yield dataclasses.replace(group, values=values)
 
 
 def read_report(path: Path) -> dict[str, Any]:

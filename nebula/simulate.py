@@ -176,7 +176,6 @@ def _report(
     shared = (hardware.config, hardware.costs, hardware.technology)
     scaled_node = hardware.technology.choice.energy_node_nm
     quality, missing = outcome.quality.result()
-    latency_source = "no value in the paper; one way, local wireless network"
     return {
         "schema_version": SCHEMA_VERSION,
         "provenance": _provenance(options, setting, clock),
@@ -189,7 +188,7 @@ def _report(
         "area": assemble.area(area(*shared), area(*shared, scaled_node)),
         "quality": quality,
         "frames": assemble.frames(records),
-        "sources": assemble.sources(hardware, setting.config, setting.link, latency_source),
+        "sources": assemble.sources(hardware, setting.config, setting.link),
         "notes": [*NOTES, assemble.codec_note(setting.codec, session), *missing],
     }
 
