@@ -53,7 +53,7 @@ def test_every_price_is_listed_with_its_source() -> None:
     for price in result.data["prices"]:
         assert price["source"] and price["reference"] and price["confidence"] in "ABCM"
         assert price["values"] in result.text
-    assert "counter blends, component rendering_unit: 5 fp16_multiply" in result.text
+    assert "component rendering_unit, operations 5.0 fp16_multiply" in result.text
     assert result.data["run"] is None
 
 
