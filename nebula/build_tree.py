@@ -35,6 +35,8 @@ def run(options: BuildTreeOptions) -> CommandResult:
     build_s = time.perf_counter() - begin
     with progress("proving nesting"):
         violations = prove_nesting(tree)
+    if violations:
+        raise RuntimeError(f"the tree is not nested: {violations} violations; nothing was written")
     with progress(f"writing {options.out}"):
         save_tree(tree, options.out)
     data: dict[str, Any] = {
@@ -50,6 +52,6 @@ def run(options: BuildTreeOptions) -> CommandResult:
     text = (
         f"{place.name}: {tree.leaves} leaves, {len(tree)} nodes, {tree.levels} levels, "
         f"built in {build_s:.2f} s\n"
-        f"nesting: {violations} violations on {len(tree) - 1} edges\n{options.out}"
+        f"nesting proved on {len(tree) - 1} edges\n{options.out}"
     )
     return CommandResult(data, text)
