@@ -141,6 +141,7 @@ def cli() -> None:
 @baseline_option
 @click.option("--method", type=METHODS, help="Stereo method.  [default: the accelerator's own]")
 @accelerator_option
+@click.option("--trace-fov", is_flag=True, help="Off-axis windows by the recording's half-angles.")
 @click.option("--rate-mbps", type=POSITIVE, default=100.0, show_default=True, help="Link rate.")
 @click.option("--latency-ms", type=NOT_NEGATIVE, default=20.0, show_default=True, help="One way.")
 @threads_option

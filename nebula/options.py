@@ -86,6 +86,7 @@ class SimulateOptions:
     rate_mbps: float
     latency_ms: float
     baseline_m: float
+    trace_fov: bool  # off-axis display from the recording's half-angles
     out: Path
     html: bool
 

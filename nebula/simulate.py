@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from arch import area
-from gaussians.cameras import StereoRig
+from gaussians.cameras import Display, StereoRig
+from gaussians.errors import InputError
 from gaussians.poses import HeadTrace
 from gaussians.render import StereoFrame, render_stereo
 from gaussians.stereo import PRESETS, StereoMethod
@@ -63,6 +64,7 @@ class _Setting:
 
     place: SceneInput
     trace: HeadTrace
+    display: Display
     method: StereoMethod
     hardware: Hardware
     config: SessionConfig
@@ -70,6 +72,7 @@ class _Setting:
     tree: LodTree
     codec: PaperCodec
     build_ms: float
+    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -111,6 +114,7 @@ def _prepare(options: SimulateOptions, clock: _Clock) -> _Setting:
         place = load(options.scene, options.seed)
     up = place.placement.up
     trace = head_trace(options.scene.trace, place.view, up, options.frames, options.seed)
+    display, notes = _display(options, trace)
     begin = time.perf_counter()
     with clock.stage("tree"), progress("building the tree"):
         tree = tree_of(place)
@@ -121,6 +125,7 @@ def _prepare(options: SimulateOptions, clock: _Clock) -> _Setting:
     return _Setting(
         place=place,
         trace=trace,
+        display=display,
         method=_method(options, hardware),
         hardware=hardware,
         config=config,
@@ -128,7 +133,26 @@ def _prepare(options: SimulateOptions, clock: _Clock) -> _Setting:
         tree=tree,
         codec=codec,
         build_ms=build_ms,
+        notes=notes,
     )
+
+
+def _display(options: SimulateOptions, trace: HeadTrace) -> tuple[Display, tuple[str, ...]]:
+    """The display asked for, or the recording's off-axis windows of the same size."""
+    display = options.scene.display
+    if not options.trace_fov:
+        return display, ()
+    if trace.half_angles is None:
+        raise InputError(f"--trace-fov: trace {trace.name} must be a recording with half-angles")
+    outer, inner, up, down = trace.half_angles
+    off_axis, rounding_deg = Display.from_half_angles(
+        display.width, display.height, outer, inner, up, down
+    )
+    note = (
+        f"Off-axis windows by the recording's half-angles; their offset was rounded to "
+        f"{off_axis.window_offset_px:g} px, which turns each window by {rounding_deg:.2f} degrees."
+    )
+    return off_axis, (note,)
 
 
 def _method(options: SimulateOptions, hardware: Hardware) -> StereoMethod:
@@ -146,12 +170,12 @@ def _play(options: SimulateOptions, setting: _Setting) -> _Outcome:
     quality = QualityComparison(setting.tree, place.scene, options.frames)
     records: list[FrameRecord] = []
     with progress("encoding the first cut"):
-        start = session.start(_request(options, trace, 0))
+        start = session.start(_request(options, setting, 0))
     with progress("frames", options.frames) as step:
         for index in range(options.frames):
-            client = session.frame(index, _request(options, trace, index))
+            client = session.frame(index, _request(options, setting, index))
             pose, near_m = trace.pose(index), place.placement.near_m
-            rig = StereoRig(options.scene.display, pose, options.baseline_m, near_m)
+            rig = StereoRig(setting.display, pose, options.baseline_m, near_m)
             frame = render_stereo(client.selection.scene, rig, setting.method, compare=True)
             require_visible(sum(frame.visible), f"frame {index}")
             time_s = float(trace.times_s[index])
@@ -161,9 +185,9 @@ def _play(options: SimulateOptions, setting: _Setting) -> _Outcome:
     return _Outcome(session, start, records, quality, frame)
 
 
-def _request(options: SimulateOptions, trace: HeadTrace, frame: int) -> SearchRequest:
-    x, y, z = (float(c) for c in trace.positions[frame])
-    display = options.scene.display
+def _request(options: SimulateOptions, setting: _Setting, frame: int) -> SearchRequest:
+    x, y, z = (float(c) for c in setting.trace.positions[frame])
+    display = setting.display
     return SearchRequest((x, y, z), max(display.fx, display.fy), options.tau_px)
 
 
@@ -171,7 +195,7 @@ def _report(
     options: SimulateOptions, setting: _Setting, outcome: _Outcome, clock: _Clock
 ) -> dict[str, Any]:
     records, session, hardware = outcome.records, outcome.session, setting.hardware
-    display, rate_hz = options.scene.display, setting.config.display_rate.hz
+    display, rate_hz = setting.display, setting.config.display_rate.hz
     timing = assemble.timing(hardware, records)
     shared = (hardware.config, hardware.costs, hardware.technology)
     scaled_node = hardware.technology.choice.energy_node_nm
@@ -189,7 +213,7 @@ def _report(
         "quality": quality,
         "frames": assemble.frames(records),
         "sources": assemble.sources(hardware, setting.config, setting.link),
-        "notes": [*NOTES, assemble.codec_note(setting.codec, session), *missing],
+        "notes": [*NOTES, *setting.notes, assemble.codec_note(setting.codec, session), *missing],
     }
 
 
@@ -214,7 +238,7 @@ def _provenance(options: SimulateOptions, setting: _Setting, clock: _Clock) -> d
             "level": scene.level,
             "trace": setting.trace.name,
         },
-        "display": assemble.plain(scene.display),
+        "display": assemble.plain(setting.display),
         "options": {
             key: assemble.plain(value)
             for key, value in vars(options).items()

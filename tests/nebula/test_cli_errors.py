@@ -107,8 +107,8 @@ def test_options_arrive_with_their_values(run: Run, command: Any) -> None:
     line = (
         "--scene a.ply --level 2 --up +x --units-per-metre 10 --seed 5 --view 1,2,3:4,5,6 "
         "--near 0.5 --display quest3 --trace t.csv --frames 3 --search-every 2 --tau 12 "
-        "--baseline 0.07 --method paper --accelerator gscore_nebula --rate-mbps 50 --latency-ms 0 "
-        "--out o --no-html"
+        "--baseline 0.07 --trace-fov --method paper "
+        "--accelerator gscore_nebula --rate-mbps 50 --latency-ms 0 --out o --no-html"
     )
     assert run("simulate", *line.split())[0] == 0
     assert seen == [
@@ -132,6 +132,7 @@ def test_options_arrive_with_their_values(run: Run, command: Any) -> None:
             rate_mbps=50.0,
             latency_ms=0.0,
             baseline_m=0.07,
+            trace_fov=True,
             out=Path("o"),
             html=False,
         )

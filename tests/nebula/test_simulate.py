@@ -15,6 +15,7 @@ from gaussians.errors import InputError
 from nebula.options import GeneratedCity, SceneOptions, SimulateOptions
 from nebula.report import stable_part, validate_report
 from nebula.simulate import run
+from tests.gaussians.real_data import data_file
 
 SMALL = ["--city-leaves", "1000", "--width", "40", "--height", "32", "--frames", "5"]
 FILES = ["difference.png", "left.png", "report.html", "report.json", "right.png"]
@@ -42,6 +43,7 @@ def options(out: Path, **changes) -> SimulateOptions:
         "rate_mbps": 100.0,
         "latency_ms": 5.0,
         "baseline_m": 0.06,
+        "trace_fov": False,
         "out": out,
         "html": True,
     }
@@ -135,6 +137,21 @@ def test_one_and_two_threads_give_the_same_bits(tmp_path, plain):
     assert stable_part(again) == stable_part(plain[0])
     for name in ("left.png", "right.png"):
         assert (tmp_path / name).read_bytes() == (plain[1] / name).read_bytes()
+
+
+@pytest.mark.real_data
+def test_off_axis_windows_of_a_recording_are_exact_too(tmp_path):
+    trace = str(data_file("traces/eyenavgs/user110_london.csv"))
+    report = run(options(tmp_path, trace=trace, trace_fov=True)).data
+    display = report["provenance"]["display"]
+    assert display["cx_left"] - display["cx_right"] in (16, 32)  # 23 px before rounding
+    assert report["stereo"]["right_mismatching_pixels"] == 0
+    assert any("turns each window by" in note for note in report["notes"])
+
+
+def test_generated_traces_have_no_half_angles(tmp_path):
+    with pytest.raises(InputError, match="--trace-fov: trace walk must be a recording"):
+        run(options(tmp_path, trace_fov=True))
 
 
 def test_another_seed_gives_another_run(tmp_path, plain):
