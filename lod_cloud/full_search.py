@@ -57,7 +57,8 @@ def _scan(begin, end, cx, cy, cz, k, parent, child_count, means, radius, extent)
             last = above
             parent_refined = above < 0
             if not parent_refined:
-                tests += 1
+                if node == 0 or parent[node - 1] != above:  # counted once, by the first sibling
+                    tests += 1
                 parent_refined = refines(
                     cx, cy, cz, means[above, 0], means[above, 1], means[above, 2],
                     radius[above], extent[above], k,

@@ -58,20 +58,24 @@ def test_extremes_of_tau() -> None:
     assert flat_search(tree, SearchRequest((1e9, 0, 0), 929.2, 1e12)).node_ids.tolist() == [0]
 
 
-def test_threads_and_counters() -> None:
-    tree = random_tree(3000, 9)
-    request = SearchRequest((1, 2, 3), 100.0, 6.0)
+@pytest.mark.parametrize("leaves", [200, 333])
+def test_threads_change_neither_cut_nor_counters(leaves: int) -> None:
+    """The counter is of distinct nodes tested, wherever chunks of the scan end."""
+    tree = random_tree(leaves, 1)
+    request = SearchRequest((1.0, 0.0, 0.0), 900.0, 6.0)
     before = parallel.threads()
     try:
-        parallel.set_threads(1)
-        one = flat_search(tree, request)
-        parallel.set_threads(4)
-        four = flat_search(tree, request)
+        cuts = []
+        for threads in (1, 2, 3, 5):
+            parallel.set_threads(threads)
+            cuts.append(flat_search(tree, request))
     finally:
         parallel.set_threads(before)
-    assert np.array_equal(one.node_ids, four.node_ids)
-    assert 0 < one.nodes_tested <= 2 * len(tree)
-    assert one.bytes_touched == 4 * len(tree) + 24 * one.nodes_tested
+    refined = np.setdiff1d(tree.parent[cuts[0].node_ids], [-1])
+    for cut in cuts:
+        assert np.array_equal(cut.node_ids, cuts[0].node_ids)
+        assert cut.nodes_tested == cuts[0].nodes_tested >= len(refined)
+        assert cut.bytes_touched == 4 * len(tree) + 24 * cut.nodes_tested
 
 
 def cut_of(*ids: int) -> Cut:
