@@ -29,6 +29,7 @@ from gaussians.tiling import TileGrid, TileLists
 from gaussians.work import EyeWork
 
 Float32 = NDArray[np.float32]
+Int32 = NDArray[np.int32]
 
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _MINUS_HALF = np.float32(-0.5)
@@ -64,35 +65,50 @@ class _Job(NamedTuple):
     live_passes: NDArray[np.uint8]
 
 
+@njit(cache=True, error_model="numpy")
+def _place(
+    row: int, column: int, tile: int, size: tuple[int, int], xs: Float32, ys: Float32, live: Int32
+) -> int:
+    """Pixel centres of a tile's lanes, and which lie inside the image; returns their number."""
+    inside = 0
+    for lane in range(tile * tile):
+        x, y = column * tile + lane % tile, row * tile + lane // tile
+        xs[lane], ys[lane] = np.float32(x) + _HALF, np.float32(y) + _HALF
+        live[lane] = 1 if y < size[0] and x < size[1] else 0
+        inside += live[lane]
+    return inside
+
+
+@njit(cache=True, error_model="numpy")
+def _write(job: _Job, row: int, column: int, colour: Float32, t: Float32) -> None:
+    """What the lanes of a tile have gathered, in front of the background."""
+    height, width = job.transmittance.shape
+    for lane in range(job.tile * job.tile):
+        x, y = column * job.tile + lane % job.tile, row * job.tile + lane // job.tile
+        if y < height and x < width:
+            for channel in range(3):
+                behind = t[lane] * job.background[channel]
+                job.image[y, x, channel] = colour[channel, lane] + behind
+            job.transmittance[y, x] = t[lane]
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
 def _raster_rows(begin: int, end: int, job: _Job) -> None:
     tile, tiles_x = job.tile, job.tiles_x
     features, offsets, splats = job.features, job.offsets, job.splats
-    background, image, transmittance = job.background, job.image, job.transmittance
     work, live_passes = job.work, job.live_passes
-    height, width = transmittance.shape
+    size = job.transmittance.shape
     pixels = tile * tile
     xs, ys = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
     power, weight = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
-    t = np.empty(pixels, np.float32)
-    red, green, blue = (
-        np.empty(pixels, np.float32),
-        np.empty(pixels, np.float32),
-        np.empty(pixels, np.float32),
-    )
+    t, colour = np.empty(pixels, np.float32), np.empty((3, pixels), np.float32)
+    red, green, blue = colour[0], colour[1], colour[2]
     live, passed = np.empty(pixels, np.int32), np.empty(pixels, np.int32)
     record_passes = live_passes.shape[0] > 0
     for row in range(begin, end):
         for column in range(job.first_column, job.last_column):
-            live_count = 0
-            for lane in range(pixels):
-                x, y = column * tile + lane % tile, row * tile + lane // tile
-                xs[lane], ys[lane] = np.float32(x) + _HALF, np.float32(y) + _HALF
-                inside = x < width and y < height
-                live[lane] = 1 if inside else 0
-                live_count += live[lane]
-                t[lane] = _ONE
-                red[lane] = green[lane] = blue[lane] = _ZERO
+            live_count = _place(row, column, tile, size, xs, ys, live)
+            t[:], colour[:] = _ONE, _ZERO
             processed, checks, passes, blends = 0, 0, 0, 0
             index = row * tiles_x + column
             for entry in range(offsets[index], offsets[index + 1]):
@@ -134,13 +150,7 @@ def _raster_rows(begin: int, end: int, job: _Job) -> None:
                     blue[lane] = blue[lane] + bl * weight[lane]
                 live_count -= stopped
                 blends += hits - stopped
-            for lane in range(pixels):
-                x, y = column * tile + lane % tile, row * tile + lane // tile
-                if x < width and y < height:
-                    image[y, x, 0] = red[lane] + t[lane] * background[0]
-                    image[y, x, 1] = green[lane] + t[lane] * background[1]
-                    image[y, x, 2] = blue[lane] + t[lane] * background[2]
-                    transmittance[y, x] = t[lane]
+            _write(job, row, column, colour, t)
             work[0, row, column] = processed
             work[1, row, column] = checks
             work[2, row, column] = passes

@@ -63,6 +63,7 @@ def kernels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
             rate_mbps=100.0,
             latency_ms=0.0,
             baseline_m=0.06,
+            trace_fov=False,
             out=tmp_path_factory.mktemp("out"),
             html=False,
         )

@@ -62,7 +62,9 @@ class Page(HTMLParser):
 
 
 def test_the_sample_report_is_valid() -> None:
-    validate_report(sample_report())
+    report = sample_report()
+    validate_report(report)
+    assert report == sample_report()
 
 
 def test_the_documentation_holds_the_table_of_the_schema() -> None:
@@ -247,7 +249,8 @@ def test_a_single_search_without_updates_has_a_page() -> None:
     report["lod"].update(overlap_mean=None, cut_sizes=[5], search_ms=[1.0])
     report["stream"].update(message_bytes=[10], mbps_mean=0.0)
     report["notes"] = []
-    Page(html_page(report, {}))
+    page = html_page(report, {})
+    assert Page(page).tags and "Cut size per search" in page
 
 
 # ---------------------------------------------------------------- charts and numbers
