@@ -13,6 +13,7 @@ from gaussians.errors import InputError
 Float32 = NDArray[np.float32]
 
 SH_DEGREE_OF_COUNT = {1: 0, 4: 1, 9: 2, 16: 3}
+_UNIT_ROUNDING = 2.0**-23  # rounding components to float32 moves a length of 1 by half of this
 
 
 @dataclass(frozen=True)
@@ -114,9 +115,14 @@ def concatenate(scenes: list[Scene]) -> Scene:
 
 
 def normalised_quaternions(quaternions: NDArray[np.floating], name: str = "scene") -> Float32:
-    """Unit quaternions [N, 4] float32; normalised in float64. Zero length raises InputError."""
+    """Unit quaternions [N, 4] float32; normalised in float64. Zero length raises InputError.
+
+    Rows that rounding to float32 may have left off length 1 keep their bits, so that normalising
+    again, as reading a written file does, changes nothing.
+    """
     wide = np.asarray(quaternions, np.float64)
     norms = np.linalg.norm(wide, axis=1, keepdims=True)
+    norms[np.abs(norms - 1.0) <= _UNIT_ROUNDING] = 1.0
     if len(wide) and not (norms > 0).all():
         bad = int(np.argmin(norms[:, 0] > 0))
         raise InputError(f"{name}: quaternion {bad} must not have length {norms[bad, 0]:g}")

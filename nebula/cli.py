@@ -72,13 +72,19 @@ scene_options = _options(
     click.option("--units-per-metre", type=POSITIVE, help="Scene units per metre.  [default: 1]"),
 )
 seed_option = click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
-view_options = _options(
-    click.option("--view", metavar="EX,EY,EZ:LX,LY,LZ", help="Eye and look-at, scene units."),
-    click.option("--near", "near_m", type=POSITIVE, help="Near plane, m.  [default: 0.2]"),
+view_option = click.option(
+    "--view", metavar="EX,EY,EZ:LX,LY,LZ", help="Eye and look-at, scene units."
+)
+display_options = _options(
     click.option("--fov", "fov_deg", type=POSITIVE, help="Horizontal, degrees.  [default: 96]"),
     click.option("--width", type=int, help="Pixels per eye.  [default: 1024]"),
     click.option("--height", type=int, help="Pixels per eye.  [default: 1024]"),
     click.option("--display", metavar="NAME", help="prototype or quest3, instead of the three."),
+)
+view_options = _options(
+    view_option,
+    click.option("--near", "near_m", type=POSITIVE, help="Near plane, m.  [default: 0.2]"),
+    display_options,
 )
 baseline_option = click.option(
     "--baseline",
@@ -172,14 +178,49 @@ def render(json_target: str | None, **values: Any) -> None:
 
 
 @cli.command()
+@click.argument("file", required=False)
 @scene_options
 @seed_option
 @json_option
-def info(json_target: str | None, **values: Any) -> None:
-    """Say what is in a scene."""
+def info(file: str | None, json_target: str | None, **values: Any) -> None:
+    """Say what is in a scene or a tree; FILE is the same as --scene FILE."""
     from nebula.options import InfoOptions
 
+    if file is not None and values["scene"] is not None:
+        raise InputError("FILE and --scene name the same thing; give one of them")
+    values["scene"] = values["scene"] or file
     _execute("info", InfoOptions, values, json_target)
+
+
+@cli.command()
+@click.argument("source", metavar="IN")
+@click.argument("out", metavar="OUT", type=click.Path(path_type=Path))
+@click.option("--config", metavar="NAME|FILE", help="Level, up axis, view from configs/scenes/.")
+@click.option("--level", type=click.IntRange(min=0), help="Level of a scene; 0 is the finest.")
+@click.option(
+    "--crop", metavar="X0,Y0,Z0:X1,Y1,Z1", help="Keep the means in this box, units of IN."
+)
+@click.option("--sh-degree", type=click.IntRange(0, 3), help="Drop the harmonics above.")
+@click.option("--decimate-tau", "decimate_tau_px", type=NOT_NEGATIVE, help="LoD cut at a view, px.")
+@view_option
+@display_options
+@click.option("--up", metavar="FROM:TO", help="Turn the scene, such as -y:+z.")
+@click.option("--clamp", is_flag=True, help="Move values OUT cannot hold to its limits, counted.")
+@threads_option
+@json_option
+def convert(source: str, up: str | None, json_target: str | None, **values: Any) -> None:
+    """Write scene IN as OUT (.ply, .splat or .spz), whole or in part.
+
+    Applied in this order: level, crop, SH degree, decimation, up axis. View and display serve the
+    decimation.
+    """
+    from nebula.options import ConvertOptions, parse_up_change
+
+    idle = [f"--{key.removesuffix('_deg')}" for key in _VIEW_KEYS if values[key] is not None]
+    if values["decimate_tau_px"] is None and idle:
+        raise InputError(f"{', '.join(idle)}: of use for --decimate-tau only, which is not given")
+    old, values["new_up"] = (None, None) if up is None else parse_up_change(up)
+    _execute("convert", ConvertOptions, values | {"scene": source, "up": old}, json_target)
 
 
 @cli.command("build-tree")
@@ -240,9 +281,10 @@ def energy(json_target: str | None, **values: Any) -> None:
     _execute("energy", EnergyOptions, values, json_target)
 
 
+_VIEW_KEYS = ("view", "fov_deg", "width", "height", "display")
 _SCENE_KEYS = (
-    *("scene", "city_leaves", "level", "up", "units_per_metre", "view", "near_m"),
-    *("fov_deg", "width", "height", "display", "trace"),
+    *("scene", "city_leaves", "level", "up", "units_per_metre", "near_m", "trace"),
+    *_VIEW_KEYS,
 )
 
 

@@ -111,6 +111,19 @@ class InfoOptions:
 
 
 @dataclass(frozen=True)
+class ConvertOptions:
+    """``nebula convert``: a scene file to another one, all lengths in file units."""
+
+    scene: SceneOptions  # file, level, old vertical; view and display count for decimation only
+    out: Path
+    crop: str | None  # X0,Y0,Z0:X1,Y1,Z1
+    decimate_tau_px: float | None
+    sh_degree: int | None
+    new_up: str | None  # None: the scene is not turned
+    clamp: bool
+
+
+@dataclass(frozen=True)
 class BuildTreeOptions:
     """``nebula build-tree``: a scene to a tree directory."""
 
@@ -186,6 +199,16 @@ def scene_options(config: str | None, given: Mapping[str, Any]) -> SceneOptions:
         display=_display(given, file),
         trace=trace,
     )
+
+
+def parse_up_change(text: str) -> tuple[str, str]:
+    """``FROM:TO``, two of ``UP_AXES``; anything else is an InputError."""
+    old, _, new = text.partition(":")
+    if old not in UP_AXES or new not in UP_AXES:
+        raise InputError(
+            f"--up must be FROM:TO with two of {', '.join(UP_AXES)}, such as -y:+z, not '{text}'"
+        )
+    return old, new
 
 
 def _benchmark(mapping: dict[str, Any], name: str) -> tuple[BenchmarkView, SceneConfig]:

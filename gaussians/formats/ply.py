@@ -7,30 +7,24 @@ Properties are found by name, in any order: ``x y z``, ``f_dc_0..2``, optionally
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gaussians.errors import InputError
-from gaussians.scene import Scene, normalised_quaternions
+from gaussians.formats.files import file_size, shown, write_atomically
+from gaussians.formats.ply_header import PlyElement, check_size, read_header
+from gaussians.scene import FIELDS, Scene, normalised_quaternions
 
-_NUMBER_TYPES = {
-    **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1"},
-    **{"short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2"},
-    **{"int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4"},
-    **{"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8"},
-}
-_LINE_LIMIT = 1024
-_HEADER_LINES_LIMIT = 4096
 _POSITION = ("x", "y", "z")
 _BASE_COLOUR = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALE = ("scale_0", "scale_1", "scale_2")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 _REQUIRED = (*_POSITION, *_BASE_COLOUR, "opacity", *_SCALE, *_ROTATION)
+_BLOCK = 2**16  # rows written at a time
 _REST_COUNTS = (0, 9, 24, 45)  # three channels of 0, 3, 8 or 15 coefficients: degree 0 to 3
 # Finite stand-ins whose float64 activation rounds to exactly these float32 values.
 _LOGIT_OF_ONE = 20.0  # 1 - 2.1e-9 is nearer to 1 than to the float32 below it
@@ -44,68 +38,53 @@ def read_ply(path: Path) -> Scene:
     number of ``f_rest_*``, no Gaussians, truncation, trailing bytes and values that are not finite.
     Double properties are rounded to float32.
     """
+    (table,) = _tables(path, None)
+    return _activate(table, str(path))
+
+
+def iterate_ply(path: Path, chunk: int = 2**18) -> Iterator[Scene]:
+    """The Gaussians of an INRIA PLY of any size, ``chunk`` at a time, in file order.
+
+    Together the scenes are what ``read_ply`` returns, bit for bit, in memory that depends on
+    ``chunk`` alone. Errors are those of ``read_ply``, raised when the chunk is reached; a header or
+    size that is wrong is found before the first scene.
+    """
+    if chunk < 1:
+        raise InputError(f"chunk must be a positive number of Gaussians, not {chunk}")
+    first = 0
+    for table in _tables(path, chunk):
+        yield _activate(table, str(path) if first == 0 else f"{path} from Gaussian {first} on")
+        first += len(table)
+
+
+def _tables(path: Path, chunk: int | None) -> Iterator[NDArray[np.void]]:
+    """The rows, ``chunk`` at a time (None: all at once), after the checks of header and size."""
+    file_size(path)
     try:
         with path.open("rb") as stream:
-            count, fields = _parse_header(_header_lines(stream, path), path)
-            dtype = np.dtype(fields)
-            have = os.fstat(stream.fileno()).st_size - stream.tell()
-            if have != count * dtype.itemsize:
-                kind = "truncated" if have < count * dtype.itemsize else "has trailing bytes"
-                raise InputError(
-                    f"{path}: {kind}: {count} Gaussians of {dtype.itemsize} bytes must be "
-                    f"followed by the end of the file, but the header is followed by {have} bytes"
-                )
-            table = np.fromfile(stream, dtype, count)
+            vertex = _vertex(read_header(stream, path), path)
+            check_size(stream, path, [vertex])
+            step = vertex.rows if chunk is None else chunk
+            for first in range(0, vertex.rows, step):
+                count = min(step, vertex.rows - first)
+                table = np.fromfile(stream, vertex.dtype, count)
+                if len(table) != count:
+                    raise InputError(f"{path}: truncated while it was read")
+                yield table
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    return _activate(table, path)
 
 
-def _header_lines(stream: BinaryIO, path: Path) -> Iterator[list[str]]:
-    """The words of each header line; the stream stands behind ``end_header`` afterwards."""
-    if stream.readline(_LINE_LIMIT).rstrip(b"\r\n") != b"ply":
-        raise InputError(f"{path}: must begin with the line 'ply'")
-    for _ in range(_HEADER_LINES_LIMIT):
-        line = stream.readline(_LINE_LIMIT)
-        if not line.endswith(b"\n"):
-            break
-        words = line.decode("ascii", "replace").split()
-        if words == ["end_header"]:
-            return
-        if words and words[0] not in ("comment", "obj_info"):
-            yield words
-    raise InputError(f"{path}: the PLY header must end with the line 'end_header'")
-
-
-def _parse_header(lines: Iterator[list[str]], path: Path) -> tuple[int, list[tuple[str, str]]]:
-    """Number of Gaussians and (name, NumPy type) of each property in file order."""
-    count: int | None = None
-    fields: dict[str, str] = {}
-    flavour: list[str] = []
-    for words in lines:
-        match words:
-            case ["format", *rest]:
-                flavour = rest
-            case ["element", "vertex", number] if count is None and number.isdecimal():
-                count = int(number)
-            case ["element", *_]:
-                raise InputError(
-                    f"{path}: must hold one element 'vertex' with a count, not '{' '.join(words)}'"
-                )
-            case ["property", kind, name] if count is not None and kind in _NUMBER_TYPES:
-                if name in fields:
-                    raise InputError(f"{path}: property {name!r} must be declared once")
-                fields[name] = _NUMBER_TYPES[kind]
-            case _:
-                raise InputError(f"{path}: unexpected header line '{' '.join(words)}'")
-    if flavour != ["binary_little_endian", "1.0"]:
-        raise InputError(
-            f"{path}: PLY format must be 'binary_little_endian 1.0', not '{' '.join(flavour)}'"
-        )
-    if not count:
+def _vertex(elements: list[PlyElement], path: Path) -> PlyElement:
+    """The one element of an INRIA PLY, checked."""
+    for element in elements:
+        if element.name != "vertex":
+            line = f"element {element.name} {element.rows}"
+            raise InputError(f"{path}: must hold one element 'vertex', not {shown(line)}")
+    if not elements or not elements[0].rows:
         raise InputError(f"{path}: empty: must hold at least one Gaussian")
-    _check_properties(fields, path)
-    return count, list(fields.items())
+    _check_properties(elements[0].fields, path)
+    return elements[0]
 
 
 def _check_properties(fields: dict[str, str], path: Path) -> None:
@@ -128,23 +107,24 @@ def _rest_names(count: int) -> tuple[str, ...]:
     return tuple(f"f_rest_{i}" for i in range(count))
 
 
-def _activate(table: NDArray[np.void], path: Path) -> Scene:
+def _activate(table: NDArray[np.void], name: str) -> Scene:
     """Stored parameters to a scene; every stored value must be finite in float32."""
 
     def columns(names: tuple[str, ...]) -> NDArray[np.float32]:
         result = np.empty((len(table), len(names)), np.float32)
-        for i, name in enumerate(names):
+        for i, column in enumerate(names):
             with np.errstate(over="ignore"):  # a double beyond float32 becomes inf: refused below
-                result[:, i] = table[name]
+                result[:, i] = table[column]
             finite = np.isfinite(result[:, i])
             if not finite.all():
+                bad = int(np.argmin(finite))
                 raise InputError(
-                    f"{path}: property {name!r} must be finite; Gaussian {int(np.argmin(finite))} "
-                    f"has {table[name][np.argmin(finite)]}"
+                    f"{name}: property {column!r} must be finite; Gaussian {bad} has "
+                    f"{table[column][bad]}"
                 )
         return result
 
-    rest_count = sum(name.startswith("f_rest_") for name in table.dtype.names or ())
+    rest_count = sum(column.startswith("f_rest_") for column in table.dtype.names or ())
     harmonics = np.empty((len(table), 1 + rest_count // 3, 3), np.float32)
     harmonics[:, 0] = columns(_BASE_COLOUR)
     if rest_count:
@@ -155,8 +135,8 @@ def _activate(table: NDArray[np.void], path: Path) -> Scene:
     with np.errstate(over="ignore"):  # exp(-logit) may be inf: opacity 0; an inf scale is refused
         opacities = (1.0 / (1.0 + np.exp(-logits))).astype(np.float32)
         scales = np.exp(logarithms).astype(np.float32)
-    quaternions = normalised_quaternions(columns(_ROTATION), str(path))
-    return Scene(columns(_POSITION), quaternions, scales, opacities, harmonics).validate(str(path))
+    quaternions = normalised_quaternions(columns(_ROTATION), name)
+    return Scene(columns(_POSITION), quaternions, scales, opacities, harmonics).validate(name)
 
 
 def write_ply(scene: Scene, path: Path) -> None:
@@ -179,23 +159,32 @@ def write_ply(scene: Scene, path: Path) -> None:
             f"{path}: opacities must be at most 1 to be stored as logits; "
             f"Gaussian {bad} has {scene.opacities[bad]}"
         )
-    rest = scene.sh[:, 1:].transpose(0, 2, 1).reshape(len(scene), -1)
-    names = (*_POSITION, "nx", "ny", "nz", *_BASE_COLOUR, *_rest_names(rest.shape[1]))
+    write_atomically(path, _blocks(scene))
+
+
+def fit_ply(scene: Scene) -> tuple[Scene, dict[str, int]]:
+    """The scene as a PLY can hold it (opacities above 1 become 1), and how many values changed."""
+    above = int((scene.opacities > 1).sum())
+    if not above:
+        return scene, {}
+    fitted = replace(scene, opacities=np.minimum(scene.opacities, np.float32(1)))
+    return fitted, {"opacities above 1": above}
+
+
+def _blocks(scene: Scene) -> Iterator[bytes]:
+    """Header, then the rows."""
+    rest_count = 3 * (scene.sh.shape[1] - 1)
+    names = (*_POSITION, "nx", "ny", "nz", *_BASE_COLOUR, *_rest_names(rest_count))
     names += ("opacity", *_SCALE, *_ROTATION)
-    normals = np.zeros((len(scene), 3), np.float32)
-    logits = _logit(scene.opacities)[:, None]
-    blocks = [scene.means, normals, scene.sh[:, 0], rest, logits, _log(scene.scales)]
-    table = np.concatenate([*blocks, scene.quaternions], axis=1).astype("<f4")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(scene)}"]
     header += [f"property float {name}" for name in names]
-    content = "\n".join([*header, "end_header", ""]).encode("ascii") + table.tobytes()
-    partial = path.with_name(path.name + ".partial")
-    try:
-        partial.write_bytes(content)
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
+    yield "\n".join([*header, "end_header", ""]).encode("ascii")
+    for first in range(0, len(scene), _BLOCK):
+        part = Scene(*(getattr(scene, field)[first : first + _BLOCK] for field in FIELDS))
+        rest = part.sh[:, 1:].transpose(0, 2, 1).reshape(len(part), -1)
+        logits, normals = _logit(part.opacities)[:, None], np.zeros((len(part), 3), np.float32)
+        columns = [part.means, normals, part.sh[:, 0], rest, logits, _log(part.scales)]
+        yield np.concatenate([*columns, part.quaternions], axis=1).astype("<f4").tobytes()
 
 
 def _logit(opacities: NDArray[np.float32]) -> NDArray[np.float32]:

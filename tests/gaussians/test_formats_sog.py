@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import pytest
 from PIL import Image
 
 from gaussians.errors import InputError
-from gaussians.formats import load_scene
+from gaussians.formats import load_lod_set, load_scene
 from tests.gaussians.real_data import data_file
 
 BANDS_OF_DEGREE = {1: 3, 2: 8, 3: 15}
@@ -172,6 +173,9 @@ BAD_SOG = {
     "absolute": (with_meta(GOOD, sh0__files=["/etc/passwd"]), "plain file names"),
     "folder": (with_meta(GOOD, sh0__files=["a/sh0.webp"]), "plain file names, not 'a/sh0.webp'"),
     "drive": (with_meta(GOOD, sh0__files=["C:\\x.webp"]), "plain file names"),
+    "surrogate": (with_meta(GOOD, sh0__files=["\ud800"]), "plain file names, not '.ud800'"),
+    "newline": (with_meta(GOOD, sh0__files=["a\nb"]), "plain file names, not 'a.nb'"),
+    "long name": (with_meta(GOOD, sh0__files=["a" * 300]), "plain file names, not 'a+[.]{3}"),
     "number": (with_meta(GOOD, sh0__files=[3]), "plain file names, not 3"),
     "missing file": (
         with_meta(GOOD, sh0__files=["x.webp"]),
@@ -213,6 +217,47 @@ def test_bad_sog_is_refused_in_one_clear_line(tmp_path, case):
         assert "\n" not in str(raised.value)
 
 
+def test_an_archive_cannot_inflate_beyond_what_its_directory_says(tmp_path):
+    path = as_archive(tmp_path / "a.sog", {**GOOD, "meta.json": b"{}" + b" " * 2**25})
+    content = bytearray(path.read_bytes())
+    for signature, size_at in ((b"PK\x01\x02", 24), (b"PK\x03\x04", 22)):
+        at = content.rindex(signature)  # meta.json is the last member
+        assert b"meta.json" in content[at : at + 80]
+        content[at + size_at : at + size_at + 4] = (100).to_bytes(4, "little")
+    path.write_bytes(content)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match="must be an intact, unencrypted zip archive"):
+            load_scene(path)
+        assert tracemalloc.get_traced_memory()[1] < 2**20
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_methods_that_inflate_without_bound_are_refused(tmp_path, method):
+    with zipfile.ZipFile(tmp_path / "a.sog", "w", method) as archive:
+        archive.writestr("meta.json", bytes(10**6))
+    with pytest.raises(InputError, match=r"meta\.json must be stored or deflated"):
+        load_scene(tmp_path / "a.sog")
+
+
+def test_a_small_file_cannot_claim_millions_of_gaussians(tmp_path):
+    flat = webp(np.zeros((1000, 1000, 4), np.uint8))
+    files = {**with_meta(GOOD, count=10**6), "means_l.webp": flat}
+    with pytest.raises(InputError, match=r"bytes must not expand to 1000000 Gaussians"):
+        load_scene(as_folder(tmp_path, files))
+
+
+def test_numbers_beyond_floats_are_refused(tmp_path):
+    huge = with_meta(GOOD, means__mins=[10**400, 0, 0])
+    with pytest.raises(InputError, match="mins must be a list of 3 finite numbers"):
+        load_scene(as_folder(tmp_path, huge))
+    wide = with_meta(GOOD, sh0__codebook=[1e300] * 256)
+    with pytest.raises(InputError, match="sh must be finite"):
+        load_scene(as_folder(tmp_path, wide))
+
+
 def test_damaged_archives_are_refused(tmp_path):
     path = as_archive(tmp_path / "a.sog", GOOD)
     content = bytearray(path.read_bytes())
@@ -231,6 +276,9 @@ def test_damaged_archives_are_refused(tmp_path):
         load_scene(path)
 
 
+BOX = {"min": [-9, -9, -9], "max": [99, 99, 99]}
+
+
 def pyramid(folder: Path, **changes: object) -> Path:
     """Two levels: level 0 has 9 + 5 Gaussians in two files, level 1 has 4 in one, with a gap."""
     as_folder(folder / "0_0", random_sog(9, 1, seed=1))
@@ -239,7 +287,10 @@ def pyramid(folder: Path, **changes: object) -> Path:
 
     def leaf(**lods: tuple[int, int, int]) -> dict[str, object]:
         keys = ("file", "offset", "count")
-        return {"lods": {level[1:]: dict(zip(keys, v, strict=True)) for level, v in lods.items()}}
+        return {
+            "bound": BOX,
+            "lods": {level[1:]: dict(zip(keys, v, strict=True)) for level, v in lods.items()},
+        }
 
     leaves = [
         leaf(L0=(2, 0, 5), L1=(1, 4, 2)),
@@ -273,7 +324,8 @@ def test_one_level_is_the_union_of_its_leaf_ranges(tmp_path):
 
 
 def lone(level: str, **entry: object) -> dict[str, object]:
-    return {"tree": {"lods": {level: {"file": 0, "offset": 0, "count": 1, **entry}}}}
+    lods = {level: {"file": 0, "offset": 0, "count": 1, **entry}}
+    return {"tree": {"bound": BOX, "lods": lods}}
 
 
 TWO_RANGES = {"children": [lone("0", count=5)["tree"], lone("0", offset=4)["tree"]]}
@@ -287,6 +339,14 @@ BAD_PYRAMID = {
     "overlap": ({"tree": TWO_RANGES}, 0, "ranges of 0_0/meta.json must not overlap"),
     "file": (lone("0", file=3), 0, "file must be an integer from 0 to 2, not 3"),
     "offset": (lone("0", offset=-1), 0, "offset must be an integer"),
+    "version": ({"version": 2}, 0, "version must be 1, not 2"),
+    "counts": ({"counts": [13, 4]}, 0, r"the 14 Gaussians .* level 0, not \[13, 4\]"),
+    "repeated": ({"filenames": ["a", "b", "a"]}, 0, "filenames must not repeat"),
+    "no bound": ({"tree": {"lods": {}}}, 0, "must have the key 'bound'"),
+    "bound": (
+        {"tree": {"lods": {}, "bound": {"min": [0, 1, 0], "max": [0, 0, 0]}}},
+        *(0, "min must not exceed max"),
+    ),
     "no lods": ({"tree": {}}, 0, "must have the key 'lods'"),
     "no range": (lone("1"), 0, "level 0 is empty"),
     "empty range": (lone("0", count=0), 0, "level 0 is empty"),
@@ -305,6 +365,40 @@ def test_bad_levels_are_refused(tmp_path, case):
     with pytest.raises(InputError, match=message):
         load_scene(folder, level=level)
 
+    with pytest.raises(InputError, match=message):
+        load_lod_set(folder / "lod-meta.json", [level])
+
+
+def test_all_levels_that_are_present_with_their_leaves(tmp_path):
+    path = pyramid(tmp_path) / "lod-meta.json"
+    lod_set = load_lod_set(str(path))
+    assert (lod_set.level_count, sorted(lod_set.levels)) == (2, [0, 1])
+    assert lod_set.leaf_boxes.tolist() == [[[-9] * 3, [99] * 3]] * 3
+    assert lod_set.leaf_ranges[0].tolist() == [[0, 5], [5, 3], [8, 6]]
+    assert lod_set.leaf_ranges[1].tolist() == [[0, 2], [2, 0], [2, 2]]
+    assert len(lod_set.files) == len(set(lod_set.files)) == 1 + 2 * 8 + 1
+    for level in (0, 1):
+        scene, _ = load_scene(path, level)
+        leaves = [lod_set.leaf(leaf, level) for leaf in range(3)]
+        assert [len(leaf) for leaf in leaves] == lod_set.leaf_ranges[level][:, 1].tolist()
+        assert np.array_equal(np.concatenate([leaf.means for leaf in leaves]), scene.means)
+    stored = load_scene(tmp_path / "0_0")[0]
+    assert np.array_equal(lod_set.leaf(1, 0).means, stored.means[6:9])
+
+
+def test_levels_without_files_are_left_out_but_not_levels_that_lack_some(tmp_path):
+    path = pyramid(tmp_path) / "lod-meta.json"
+    (tmp_path / "1_0.sog").unlink()
+    assert sorted(load_lod_set(path).levels) == [0]
+    with pytest.raises(InputError, match=r"1_0\.sog: cannot be read"):
+        load_lod_set(path, [1])
+    (tmp_path / "0_1" / "meta.json").unlink()
+    with pytest.raises(InputError, match=r"0_1/meta\.json: cannot be read"):
+        load_lod_set(path)
+    (tmp_path / "0_0" / "meta.json").unlink()
+    with pytest.raises(InputError, match="no level of the scene is present"):
+        load_lod_set(path)
+
 
 def test_a_folder_with_two_scenes_must_be_named_by_file(tmp_path):
     pyramid(tmp_path)
@@ -320,5 +414,15 @@ def test_playbot_levels_have_their_known_counts():
     for level in range(1, 7):
         scene, files = load_scene(folder, level)
         assert (len(scene), scene.sh_degree, len(files)) == (counts[level], 2, 9)
+    lod_set = load_lod_set(folder / "lod-meta.json", range(2, 7))
+    assert {level: len(scene) for level, scene in lod_set.levels.items()} == dict(
+        zip(range(2, 7), counts[2:], strict=True)
+    )
+    for level, ranges in lod_set.leaf_ranges.items():
+        assert ranges[:, 1].sum() == counts[level]
+        for leaf, (low, high) in enumerate(lod_set.leaf_boxes):
+            means = lod_set.leaf(leaf, level).means
+            assert (means >= low).all()
+            assert (means <= high).all()
     with pytest.raises(InputError, match=r"0 \(finest\) to 6, not 7"):
         load_scene(folder, 7)

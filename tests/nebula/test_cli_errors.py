@@ -29,6 +29,7 @@ COMMANDS = {
     "simulate": ([], "SimulateOptions"),
     "render": ([], "RenderOptions"),
     "info": ([], "InfoOptions"),
+    "convert": (["in.sog", "out.ply"], "ConvertOptions"),
     "build-tree": (["--out", "tree"], "BuildTreeOptions"),
     "search": (["--tree", "tree"], "SearchOptions"),
     "area": ([], "AreaOptions"),
