@@ -67,11 +67,7 @@ def _describe(place: SceneInput) -> dict[str, Any]:
         "opacity_histogram": _opacity_histogram(opacities),
         "scale_histogram": _scale_histogram(largest),
         "oddities": _oddities(scene, means, bounds[1], bounds[3]),
-        "view": {
-            "eye_m": place.view.position.tolist(),
-            "forward": place.view.rotation[:, 2].tolist(),
-        },
-        "suggested": _suggestion(place),
+        **_views(place),
         "memory_bytes": _memory(scene),
         "inputs": describe_files(place.files),
     }
@@ -123,6 +119,19 @@ def _oddities(scene: Scene, means: Float64, low: Float64, high: Float64) -> dict
         "needles_10000": needles[1],
         "some_scale_zero": int(np.count_nonzero(~solid)),
         "all_scales_zero": int(np.count_nonzero(largest == 0)),
+    }
+
+
+def _views(place: SceneInput) -> dict[str, Any]:
+    """The first view and a suggested one; both None for a scene without extent (one point)."""
+    try:
+        first, suggested = place.view, _suggestion(place)
+    except InputError:
+        return {"view": None, "suggested": None}
+    forward = first.rotation[:, 2].tolist()
+    return {
+        "view": {"eye_m": first.position.tolist(), "forward": forward},
+        "suggested": suggested,
     }
 
 
@@ -182,6 +191,8 @@ def _text(data: dict[str, Any]) -> str:
         f"memory: {memory['scene'] / 1e6:.1f} MB ({memory['record']} B each), "
         f"its tree about {memory['tree'] / 1e6:.1f} MB",
     ]
+    if data["view"] is None:
+        return "\n".join([*lines, "first view: none, the scene has no extent to frame"])
     eye, look = (", ".join(f"{c:.3g}" for c in data["view"][k]) for k in ("eye_m", "forward"))
     lines.append(f"first view: from ({eye}) m towards ({look})")
     lines.append(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -31,13 +32,18 @@ class SceneInput:
     generated: bool
     scene: Scene
     placement: Placement
-    view: Pose  # head pose of the first frame, metres
     walkable_path: tuple[Point, ...]  # metres; empty for files
     files: tuple[Path, ...]
 
+    @cached_property
+    def view(self) -> Pose:
+        """Head pose of the first frame, metres; InputError for a scene without extent to frame."""
+        units = self.placement.units_per_metre
+        return self.placement.view_pose(self.scene if units == 1 else self.scene.scaled(units))
+
 
 def load(options: SceneOptions, seed: int) -> SceneInput:
-    """Read or generate the scene, convert it to metres and find the first view.
+    """Read or generate the scene, convert it to metres.
 
     Raises InputError for anything wrong with file or placement.
     """
@@ -72,7 +78,6 @@ def load(options: SceneOptions, seed: int) -> SceneInput:
         generated=not isinstance(source, Path),
         scene=scene.scaled(1.0 / placement.units_per_metre),
         placement=placement,
-        view=placement.view_pose(scene),
         walkable_path=path,
         files=tuple(files),
     )

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 Parts = dict[str, bytes]
-READERS = ("ply", "compressed_ply", "splat", "spz", "sog", "lod_meta")
+READERS = ("ply", "compressed_ply", "splat", "spz", "sog", "lod_meta", "layout")
 
 
 @dataclass(frozen=True)
@@ -149,6 +149,30 @@ def _lod_meta() -> Target:
     return Target("lod-meta.json", parts, dict, bombs)
 
 
+def _layout() -> Target:
+    instances = [
+        {"scale": 0.5 + i, "quaternions": [1.0, 0.0, 0.5, 0.0], "positions": [float(i), 2.0, 3.0]}
+        for i in range(3)
+    ]
+    asset = {"asset_kind": "a", "asset_name": "b", "ply_suffix": "fused.ply"}
+    camera = {
+        "camera_name": "c",
+        "camera_width": 192,
+        "camera_height": 108,
+        "camera_angle_x": 0.785,
+        "transform_matrix": np.eye(4).tolist(),
+    }
+    layout = {
+        "layout_name": "l",
+        "assets": [{**asset, "instances": instances}],
+        "cameras": [camera],
+    }
+    ply = b"".join(_ply().parts.values())
+    parts = {"Layout.json": json.dumps({"layouts": [layout]}).encode(), "fused.ply": ply}
+    deep = {**parts, "Layout.json": b'{"layouts":[' * 200_000}
+    return Target("Layout.json", parts, dict, [deep])
+
+
 def _sog_parts(count: int, degree: int, seed: int) -> Parts:
     """A small SOG data set: images of 3 columns, integer code books."""
     rng = np.random.default_rng(seed)
@@ -209,5 +233,5 @@ def _understated(archive: bytes, member: str) -> bytes:
 
 
 TARGETS: dict[str, Callable[[], Target]] = dict(
-    zip(READERS, (_ply, _compressed_ply, _splat, _spz, _sog, _lod_meta), strict=True)
+    zip(READERS, (_ply, _compressed_ply, _splat, _spz, _sog, _lod_meta, _layout), strict=True)
 )

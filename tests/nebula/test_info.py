@@ -157,3 +157,12 @@ def test_real_scenes_are_described() -> None:
     train = info(data_file("scenes/train_1000/train-1000.ply"))
     assert train["sh_degree"] == 3 and train["sh_nonzero"]["splats"] == 0.961
     assert sum(train["opacity_histogram"]["counts"]) == 1000
+
+
+def test_a_single_point_has_no_view_to_suggest(tmp_path):
+    point = line_scene().take(np.array([7]))  # without thickness
+    write_ply(point, tmp_path / "point.ply")
+    options = InfoOptions(scene_options(None, {"scene": str(tmp_path / "point.ply")}), 0)
+    result = run(options)
+    assert result.data["view"] is None and result.data["suggested"] is None
+    assert "no extent to frame" in result.text
