@@ -13,6 +13,7 @@ from dataclasses import replace
 
 from arch import ClientWork, analyse_frame, frame_energy
 from gaussians.cameras import Display, StereoRig
+from gaussians.errors import InputError
 from gaussians.render import render_stereo
 from gaussians.stereo import PRESETS
 from gaussians.synthetic import generate_city
@@ -48,4 +49,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except InputError as error:
+        raise SystemExit(f"error: {error}") from None

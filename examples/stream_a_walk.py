@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gaussians.cameras import DISPLAYS
+from gaussians.errors import InputError
 from gaussians.placement import anchor
 from gaussians.poses import generate_trace
 from gaussians.synthetic import generate_city
@@ -52,4 +53,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except InputError as error:
+        raise SystemExit(f"error: {error}") from None

@@ -48,6 +48,9 @@ class _Finite(click.FloatRange):
 POSITIVE = _Finite(min=0, min_open=True)
 NOT_NEGATIVE = _Finite(min=0)
 COUNT = click.IntRange(min=1)
+LEAVES = click.IntRange(1_000, 20_000_000)
+PIXELS = click.IntRange(1, 16_384)
+FOV_DEG = _Finite(min=1, max=170)
 METHODS = click.Choice(["exact", "paper", "independent"])
 UP_AXES = click.Choice(["+x", "-x", "+y", "-y", "+z", "-z"])
 
@@ -64,9 +67,11 @@ def _options(*options: Callable[[Function], Function]) -> Callable[[Function], F
 
 
 scene_options = _options(
-    click.option("--scene", metavar="PATH", help="PLY, .splat, SOG, lod-meta.json; else a city."),
+    click.option(
+        "--scene", metavar="PATH", help="PLY, SPZ, .splat, SOG, lod-meta, layout; else a city."
+    ),
     click.option("--config", metavar="NAME|FILE", help="Scene and placement from configs/scenes/."),
-    click.option("--city-leaves", "--city", type=COUNT, help="Generated city.  [default: 300000]"),
+    click.option("--city-leaves", "--city", type=LEAVES, help="Generated city.  [default: 300000]"),
     click.option("--level", type=click.IntRange(min=0), help="Level of a scene; 0 is the finest."),
     click.option("--up", type=UP_AXES, help="Up axis.  [default: -y for files, +z for the city]"),
     click.option("--units-per-metre", type=POSITIVE, help="Scene units per metre.  [default: 1]"),
@@ -76,9 +81,9 @@ view_option = click.option(
     "--view", metavar="EX,EY,EZ:LX,LY,LZ", help="Eye and look-at, scene units."
 )
 display_options = _options(
-    click.option("--fov", "fov_deg", type=POSITIVE, help="Horizontal, degrees.  [default: 96]"),
-    click.option("--width", type=int, help="Pixels per eye.  [default: 1024]"),
-    click.option("--height", type=int, help="Pixels per eye.  [default: 1024]"),
+    click.option("--fov", "fov_deg", type=FOV_DEG, help="Horizontal, degrees.  [default: 96]"),
+    click.option("--width", type=PIXELS, help="Pixels per eye.  [default: 1024]"),
+    click.option("--height", type=PIXELS, help="Pixels per eye.  [default: 1024]"),
     click.option("--display", metavar="NAME", help="prototype or quest3, instead of the three."),
 )
 view_options = _options(
@@ -96,7 +101,9 @@ baseline_option = click.option(
 )
 trace_options = _options(
     click.option(
-        "--trace", metavar="NAME|CSV", help="stand, walk, flight, teleport or a recording."
+        "--trace",
+        metavar="NAME|CSV",
+        help="stand, walk, flight, teleport or an EyeNavGS recording.  [default: walk]",
     ),
     click.option("--frames", type=COUNT, default=12, show_default=True),
     click.option("--search-every", type=COUNT, default=4, show_default=True, help="Frames."),
@@ -112,7 +119,9 @@ accelerator_option = click.option(
     show_default=True,
     help="Or gscore_nebula.",
 )
-threads_option = click.option("--threads", type=int, help="CPU threads.  [default: all cores]")
+threads_option = click.option(
+    "--threads", type=click.IntRange(1, 1024), help="CPU threads.  [default: all cores]"
+)
 json_option = click.option(
     "--json", "json_target", metavar="FILE", help="Write the result as JSON; - is standard output."
 )

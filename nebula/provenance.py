@@ -50,7 +50,8 @@ def nebula_version() -> str:
 
 def command_line() -> str:
     """The command as it was typed."""
-    return " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    name = Path(sys.argv[0]).name
+    return " ".join(["python -m nebula" if name == "__main__.py" else name, *sys.argv[1:]])
 
 
 def now_utc() -> str:

@@ -95,6 +95,10 @@ def head_trace(name: str, view: Pose, up: str, frames: int, seed: int) -> HeadTr
     """
     if name in GENERATED_TRACES:
         relative = generate_trace(name, frames, np.random.default_rng(seed))
+    elif not Path(name).exists():
+        raise InputError(
+            f"trace must be one of {', '.join(GENERATED_TRACES)} or a recording; no file {name}"
+        )
     else:
         relative = resample(read_eyenavgs(Path(name)), DISPLAY_RATE_HZ, frames)
     return anchor(relative, view, up)

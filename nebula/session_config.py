@@ -66,7 +66,7 @@ class CodebookSize(Provenance):
 
 @dataclass(frozen=True)
 class SessionConfig:
-    """configs/session.yaml."""
+    """configs/session/session.yaml."""
 
     reuse_window: ReuseWindow
     display_rate: DisplayRate
@@ -76,5 +76,5 @@ class SessionConfig:
 
 
 def load_session_config() -> SessionConfig:
-    """The shipped configs/session.yaml."""
-    return load_config(SessionConfig, config_path("session"), "session")
+    """The shipped configs/session/session.yaml."""
+    return load_config(SessionConfig, config_path("session", "session"), "session")

@@ -109,7 +109,7 @@ def run(options: SimulateOptions) -> CommandResult:
 
 def _prepare(options: SimulateOptions, clock: _Clock) -> _Setting:
     hardware = Hardware(load_accelerator(options.accelerator), load_costs(), load_technology())
-    config = load_session_config()
+    method, config = _method(options, hardware), load_session_config()
     with clock.stage("scene"):
         place = load(options.scene, options.seed)
     up = place.placement.up
@@ -126,7 +126,7 @@ def _prepare(options: SimulateOptions, clock: _Clock) -> _Setting:
         place=place,
         trace=trace,
         display=display,
-        method=_method(options, hardware),
+        method=method,
         hardware=hardware,
         config=config,
         link=Link(options.rate_mbps, options.latency_ms, config.radio.nj_per_byte),
@@ -161,6 +161,11 @@ def _method(options: SimulateOptions, hardware: Hardware) -> StereoMethod:
     method = PRESETS[options.method or workload.stereo_method]
     if method.forwarding == "none":
         return StereoMethod(method.name, method.forwarding, workload.intersection)
+    if hardware.config.stereo is None:
+        raise InputError(
+            f"{hardware.config.name}: has no stereo units; --method must be 'independent', "
+            f"not '{method.name}'"
+        )
     return method
 
 

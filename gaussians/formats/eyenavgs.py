@@ -77,7 +77,7 @@ def find_scene_settings(trace: Path) -> Path:
             return candidate
     raise InputError(
         f"{trace}: needs the scene's scale and gravity quaternion: put {SETTINGS_NAME} of the data "
-        f"set beside it or give both"
+        f"set beside it"
     )
 
 

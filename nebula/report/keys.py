@@ -50,7 +50,7 @@ _SELF = (
         "provenance.placement.*",
         "any",
         "",
-        "How the scene is stood in: up, units_per_metre, view, near_m, level, trace, ...",
+        "How the scene is stood in: up, units_per_metre, eye_m, forward, near_m, level, trace",
     ),
     Key("provenance.display.width", "integer", "px", "Columns per eye"),
     Key("provenance.display.height", "integer", "px", "Rows per eye"),

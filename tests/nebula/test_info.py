@@ -119,7 +119,7 @@ def test_a_file_may_be_named_by_position_or_option_not_both(line: Path, capsys) 
     assert json.loads(capsys.readouterr().out) == by_position
     assert run_main(str(line), "--scene", str(line)) == 2
     assert "FILE and --scene name the same thing" in capsys.readouterr().err
-    assert run_main(str(line), "--city", "100") == 2
+    assert run_main(str(line), "--city", "1000") == 2
     assert "exclude each other" in capsys.readouterr().err
 
 
