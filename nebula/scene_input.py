@@ -15,13 +15,11 @@ from gaussians.cameras import Pose
 from gaussians.errors import InputError
 from gaussians.formats import load_scene
 from gaussians.placement import Placement, Point, View, anchor, parse_view
-from gaussians.poses import HeadTrace, generate_trace, read_eyenavgs, resample
+from gaussians.poses import GENERATED_RATE_HZ, HeadTrace, generate_trace, read_eyenavgs, resample
 from gaussians.scene import Scene
 from gaussians.synthetic import BenchmarkView, benchmark_scene, generate_city
 from nebula.options import GENERATED_TRACES, GeneratedCity, SceneOptions
 from nebula.progress import progress
-
-DISPLAY_RATE_HZ = 90.0  # paper Sec. 3.3 and 7.3
 
 
 @dataclass(frozen=True)
@@ -88,19 +86,24 @@ def _point(coordinates: Sequence[float] | NDArray[np.float64]) -> Point:
     return x, y, z
 
 
-def head_trace(name: str, view: Pose, up: str, frames: int, seed: int) -> HeadTrace:
-    """``frames`` poses at 90 Hz of a generated or recorded trace, starting at ``view``.
+def head_trace(name: str, view: Pose, up: str, frames: int, rate_hz: float, seed: int) -> HeadTrace:
+    """``frames`` poses at the display rate of a generated or recorded trace, starting at ``view``.
 
     Raises InputError when a recording cannot be read or is too short.
     """
     if name in GENERATED_TRACES:
+        if rate_hz != GENERATED_RATE_HZ:
+            raise InputError(
+                f"generated traces are of {GENERATED_RATE_HZ:g} Hz; the display rate must be that, "
+                f"not {rate_hz:g} Hz"
+            )
         relative = generate_trace(name, frames, np.random.default_rng(seed))
     elif not Path(name).exists():
         raise InputError(
             f"trace must be one of {', '.join(GENERATED_TRACES)} or a recording; no file {name}"
         )
     else:
-        relative = resample(read_eyenavgs(Path(name)), DISPLAY_RATE_HZ, frames)
+        relative = resample(read_eyenavgs(Path(name)), rate_hz, frames)
     return anchor(relative, view, up)
 
 

@@ -16,6 +16,7 @@ from nebula.options import SearchOptions
 from nebula.output import CommandResult, text_table
 from nebula.progress import progress
 from nebula.scene_input import head_trace
+from nebula.session_config import load_session_config
 
 
 def run(options: SearchOptions) -> CommandResult:
@@ -23,7 +24,8 @@ def run(options: SearchOptions) -> CommandResult:
     with progress(f"reading {options.tree}"):
         tree = load_tree(options.tree)
     view, up = _start(tree, options)
-    trace = head_trace(options.scene.trace, view, up, options.frames, options.seed)
+    rate_hz = load_session_config().display_rate.hz
+    trace = head_trace(options.scene.trace, view, up, options.frames, rate_hz, options.seed)
     focal_px = options.scene.display.fx
     rows: list[dict[str, Any]] = []
     before: Cut | None = None

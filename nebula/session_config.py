@@ -31,17 +31,6 @@ class DisplayRate(Provenance):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Radio(Provenance):
-    """Energy of the client's radio per byte received."""
-
-    nj_per_byte: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.require_not_negative("nj_per_byte")
-
-
-@dataclass(frozen=True, kw_only=True)
 class CloudTime(Provenance):
     """From the arrival of a pose at the cloud to the first byte of the answer."""
 
@@ -70,7 +59,6 @@ class SessionConfig:
 
     reuse_window: ReuseWindow
     display_rate: DisplayRate
-    radio: Radio
     cloud: CloudTime
     codebook: CodebookSize
 

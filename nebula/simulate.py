@@ -113,7 +113,8 @@ def _prepare(options: SimulateOptions, clock: _Clock) -> _Setting:
     with clock.stage("scene"):
         place = load(options.scene, options.seed)
     up = place.placement.up
-    trace = head_trace(options.scene.trace, place.view, up, options.frames, options.seed)
+    rate_hz = config.display_rate.hz
+    trace = head_trace(options.scene.trace, place.view, up, options.frames, rate_hz, options.seed)
     display, notes = _display(options, trace)
     begin = time.perf_counter()
     with clock.stage("tree"), progress("building the tree"):
@@ -129,7 +130,7 @@ def _prepare(options: SimulateOptions, clock: _Clock) -> _Setting:
         method=method,
         hardware=hardware,
         config=config,
-        link=Link(options.rate_mbps, options.latency_ms, config.radio.nj_per_byte),
+        link=Link(options.rate_mbps, options.latency_ms, hardware.costs.radio.nj_per_byte),
         tree=tree,
         codec=codec,
         build_ms=build_ms,

@@ -11,7 +11,7 @@ view axis add to them.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,19 +87,6 @@ class BenchmarkView:
             raise InputError(
                 f"view display must be one of {', '.join(DISPLAYS)}, not {self.display}"
             )
-
-    @classmethod
-    def from_mapping(cls, mapping: dict[str, object]) -> BenchmarkView:
-        """The view of a parsed YAML mapping; unknown or missing keys raise InputError."""
-        known = [field.name for field in fields(cls)]
-        for key in mapping:
-            if key not in known:
-                raise InputError(f"view: unknown key {key!r}; known keys are {', '.join(known)}")
-        values = {key: _tuples(value) for key, value in mapping.items()}
-        try:
-            return cls(**values)  # type: ignore[arg-type]  # __post_init__ checks the values
-        except TypeError as error:
-            raise InputError(f"view {mapping.get('name', '')!r}: {error}") from error
 
 
 def benchmark_scene(view: BenchmarkView) -> tuple[Scene, StereoRig]:
@@ -230,10 +217,3 @@ def _floaters(
 
 def _dot(a: Float64, b: Float64) -> Float64:
     return (a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]) + a[:, 2] * b[:, 2]
-
-
-def _tuples(value: object) -> object:
-    """Lists of a YAML file as tuples, mappings of lists likewise."""
-    if isinstance(value, dict):
-        return {key: _tuples(item) for key, item in value.items()}
-    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 
 from gaussians.cameras import Pose, StereoRig, look_at
 from gaussians.errors import InputError
@@ -19,6 +18,7 @@ from gaussians.synthetic import BenchmarkView, benchmark_scene
 from gaussians.synthetic.patches import Geometry, GeometryBuilder, Material
 from gaussians.synthetic.raycast import LAYERS, RayGrid, cast
 from gaussians.tiling import TileGrid, row_spans, tile_lists
+from nebula.config import load_dataclass, load_yaml
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "scenes"
 NAMES = ("street", "elev", "near")
@@ -38,11 +38,11 @@ REQUIRED_OF_STREET = {
 
 
 def mapping(name: str) -> dict[str, Any]:
-    return dict(yaml.safe_load((CONFIGS / f"{name}.yaml").read_text(encoding="utf-8")))
+    return load_yaml(CONFIGS / f"{name}.yaml")
 
 
 def load(name: str) -> BenchmarkView:
-    return BenchmarkView.from_mapping(mapping(name))
+    return load_dataclass(BenchmarkView, mapping(name), name)
 
 
 def reduced(name: str, **changes: Any) -> BenchmarkView:
@@ -176,11 +176,11 @@ def test_bad_views_are_refused(change: dict[str, Any], message: str) -> None:
 
 def test_unknown_and_missing_keys_are_refused() -> None:
     with pytest.raises(InputError, match="unknown key 'spaceing_px'; known keys are name, seed"):
-        BenchmarkView.from_mapping({**mapping("street"), "spaceing_px": 2})
+        load_dataclass(BenchmarkView, {**mapping("street"), "spaceing_px": 2}, "street")
     short = mapping("street")
     del short["seed"]
-    with pytest.raises(InputError, match=r"'street': .* missing .* 'seed'"):
-        BenchmarkView.from_mapping(short)
+    with pytest.raises(InputError, match="street: missing key 'seed'"):
+        load_dataclass(BenchmarkView, short, "street")
 
 
 def test_too_few_rays_are_an_error() -> None:

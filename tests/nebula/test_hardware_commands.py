@@ -14,6 +14,7 @@ from nebula.config import configs_root
 from nebula.hardware import load_accelerator
 from nebula.options import AreaOptions, EnergyOptions
 from nebula.output import json_text, text_table
+from nebula.session_config import load_session_config
 from tests.nebula.sample_report import sample_report
 
 
@@ -81,3 +82,10 @@ def test_columns_of_a_text_table_line_up() -> None:
     assert text_table(["a", "mm²"], [["bb", "1.0"], ["c", "10.0"]], numbers=(1,)) == (
         "a    mm²\nbb   1.0\nc   10.0"
     )
+
+
+def test_the_decoder_is_built_for_the_codebook_of_the_session() -> None:
+    book, decoder = load_session_config().codebook, load_accelerator("nebula").decoder
+    assert decoder is not None
+    timing = decoder.timing
+    assert (timing.codebook_words, timing.codebook_stages) == (book.words, book.stages)
