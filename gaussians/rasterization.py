@@ -54,6 +54,7 @@ class _Job(NamedTuple):
     tile: int
     first_column: int
     last_column: int  # exclusive
+    origin: int  # the grid's first column
     tiles_x: int
     features: Float32  # [M, 10]
     offsets: NDArray[np.int64]
@@ -67,13 +68,20 @@ class _Job(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def _place(
-    row: int, column: int, tile: int, size: tuple[int, int], xs: Float32, ys: Float32, live: Int32
+    row: int,
+    column: int,
+    tile: int,
+    origin: int,
+    size: tuple[int, int],
+    xs: Float32,
+    ys: Float32,
+    live: Int32,
 ) -> int:
     """Pixel centres of a tile's lanes, and which lie inside the image; returns their number."""
     inside = 0
     for lane in range(tile * tile):
         x, y = column * tile + lane % tile, row * tile + lane // tile
-        xs[lane], ys[lane] = np.float32(x) + _HALF, np.float32(y) + _HALF
+        xs[lane], ys[lane] = np.float32(origin * tile + x) + _HALF, np.float32(y) + _HALF
         live[lane] = 1 if y < size[0] and x < size[1] else 0
         inside += live[lane]
     return inside
@@ -107,7 +115,7 @@ def _raster_rows(begin: int, end: int, job: _Job) -> None:
     record_passes = live_passes.shape[0] > 0
     for row in range(begin, end):
         for column in range(job.first_column, job.last_column):
-            live_count = _place(row, column, tile, size, xs, ys, live)
+            live_count = _place(row, column, tile, job.origin, size, xs, ys, live)
             t[:], colour[:] = _ONE, _ZERO
             processed, checks, passes, blends = 0, 0, 0, 0
             index = row * tiles_x + column
@@ -191,6 +199,7 @@ def rasterise(
         grid.tile_px,
         first,
         last,
+        grid.first_column,
         grid.tiles_x,
         features,
         lists.offsets,

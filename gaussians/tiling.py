@@ -35,11 +35,13 @@ _BLOCK = 4096  # splats per unit of parallel work; rows are filled block by bloc
 
 @dataclass(frozen=True)
 class TileGrid:
-    """The tiles of one eye's window."""
+    """The tiles of one eye's window; ``first_column`` counts from the eye's image, and is not 0
+    for a window that reaches beyond it."""
 
     width: int
     height: int
     tile_px: int
+    first_column: int = 0
 
     def __post_init__(self) -> None:
         if self.tile_px not in (4, 8, 16):
@@ -88,7 +90,8 @@ class _Job(NamedTuple):
     rule: int
     tile: int
     shift: int  # log2 of tile
-    width: int
+    left: int  # first pixel column
+    right: int  # behind the last one
     height: int
 
 
@@ -105,17 +108,18 @@ def _column_span(job: _Job, u: float, v: float, shape: Shape, row: int) -> tuple
         left, right = footprint_interval(job.rule, shape, low, high)
         if left > right:
             return 1, 0
-        first = math.ceil(max(u + left - 0.5 - _SLACK_PX, -1.0))
-        last = math.floor(min(u + right - 0.5 + _SLACK_PX, np.float64(job.width)))
+        first = math.ceil(max(u + left - 0.5 - _SLACK_PX, job.left - 1.0))
+        last = math.floor(min(u + right - 0.5 + _SLACK_PX, np.float64(job.right)))
     else:
         left, right = footprint_interval(job.rule, shape, top - v, top + job.tile - v)
         if left > right:
             return 1, 0
-        first = math.floor(max(u + left, -1.0))
-        last = math.ceil(min(u + right, np.float64(job.width + 1))) - 1
-    if first > last or last < 0 or first >= job.width:
+        first = math.floor(max(u + left, job.left - 1.0))
+        last = math.ceil(min(u + right, np.float64(job.right + 1))) - 1
+    if first > last or last < job.left or first >= job.right:
         return 1, 0
-    return max(first, 0) >> job.shift, min(last, job.width - 1) >> job.shift
+    first, last = max(first, job.left) - job.left, min(last, job.right - 1) - job.left
+    return first >> job.shift, last >> job.shift
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -239,7 +243,8 @@ def row_spans(
         rule=rule,
         tile=grid.tile_px,
         shift=grid.tile_px.bit_length() - 1,
-        width=grid.width,
+        left=grid.first_column * grid.tile_px,
+        right=grid.first_column * grid.tile_px + grid.width,
         height=grid.height,
     )
     arrays = (splats.features, splats.covariances)
