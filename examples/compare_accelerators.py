@@ -15,7 +15,7 @@ from arch import ClientWork, analyse_frame, frame_energy
 from gaussians.cameras import Display, StereoRig
 from gaussians.errors import InputError
 from gaussians.render import render_stereo
-from gaussians.stereo import PRESETS
+from gaussians.stereo_method import PRESETS
 from gaussians.synthetic import generate_city
 from nebula.hardware import load_accelerator, load_costs, load_technology
 

@@ -22,7 +22,7 @@ from gaussians.cameras import Display, StereoRig
 from gaussians.errors import InputError
 from gaussians.formats.layout import read_composition
 from gaussians.render import render_stereo
-from gaussians.stereo import PRESETS
+from gaussians.stereo_method import PRESETS
 from nebula.images import png
 
 

@@ -16,7 +16,7 @@ from gaussians.errors import InputError
 from gaussians.formats import load_scene
 from gaussians.placement import Placement, parse_view
 from gaussians.render import render_stereo
-from gaussians.stereo import PRESETS
+from gaussians.stereo_method import PRESETS
 from nebula.images import png
 
 

@@ -16,7 +16,10 @@ Int32 = NDArray[np.int32]
 
 @dataclass(frozen=True)
 class EyeWork:
-    """Rasterisation work of one eye; every array is [tiles_y, tiles_x] int32."""
+    """Rasterisation work of one eye; every array is [tiles_y, tiles_x] int32.
+
+    The left eye's tiles_x is that of its widened view where the stereo method asks for one.
+    """
 
     entries: Int32  # length of the tile's list (forward-only entries not included)
     processed: Int32  # entries walked until the last pixel of the tile had stopped
@@ -35,10 +38,14 @@ class StereoWork:
 
     # Tile columns of the plane: those of the left window, and where the right window reaches beyond
     # it, virtual ones that only forward.
-    fifo_entries: Int32  # [rows, tiles_y, tiles_x] writes into row k destined for right tile x
+    # [rows, tiles_y, tiles_x] writes into row k destined for right tile x; with a spilling method
+    # one row more, what went through memory
+    fifo_entries: Int32
     forward_only: Int32  # [tiles_y, plane tiles] forwards by entries added to a left tile for them
     walked_after_termination: Int32  # [tiles_y, plane tiles] entries read only for the SRU
     dropped: int  # forwards lost because the disparity exceeds the rows (method `paper`)
+    spilled: int  # forwards that went through memory instead of a row
+    unseen: int  # right pairs lost because no left tile that forwards holds or sees the splat
     duplicates: int  # equal heads the merge unit dropped
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from arch import AreaReport, EnergyReport, sourced_groups
-from gaussians.stereo import StereoMethod
+from gaussians.stereo_method import StereoMethod
 from lod_cloud import Link, LodTree, PaperCodec
 from nebula.measure import FrameRecord, Hardware
 from nebula.session import Session, StartUp

@@ -7,7 +7,7 @@ from typing import Any
 from gaussians.cameras import StereoRig
 from gaussians.quality import mismatching_pixels, mismatching_pixels_8bit, psnr_db
 from gaussians.render import StereoFrame, render_stereo
-from gaussians.stereo import PRESETS
+from gaussians.stereo_method import PRESETS
 from nebula.images import difference_png, png
 from nebula.measure import covered_shares, own_right
 from nebula.options import RenderOptions

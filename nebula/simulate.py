@@ -15,7 +15,7 @@ from gaussians.cameras import Display, StereoRig
 from gaussians.errors import InputError
 from gaussians.poses import HeadTrace
 from gaussians.render import StereoFrame, render_stereo
-from gaussians.stereo import PRESETS, StereoMethod
+from gaussians.stereo_method import PRESETS, StereoMethod
 from lod_cloud import Link, LodTree, PaperCodec, SearchRequest
 from nebula import assemble, provenance
 from nebula.build_tree import tree_of

@@ -53,6 +53,8 @@ def frame(
         forward_only=zero if forward_only is None else np.asarray(forward_only, np.int32),
         walked_after_termination=left.entries - left.processed if stereo else zero,
         dropped=0,
+        spilled=0,
+        unseen=0,
         duplicates=0,
     )
     own = independent_right_tiles if stereo else tiles_y * tiles_x

@@ -11,7 +11,7 @@ from arch import AcceleratorConfig, analyse_frame
 from gaussians.cameras import Display, StereoRig, look_at
 from gaussians.render import render_stereo
 from gaussians.scene import Scene, normalised_quaternions
-from gaussians.stereo import PRESETS
+from gaussians.stereo_method import PRESETS
 from gaussians.tiling import Intersection
 from gaussians.work import FrameWork
 from tests.arch.build import client

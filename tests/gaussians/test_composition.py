@@ -14,7 +14,7 @@ from gaussians.projection import project
 from gaussians.render import render_stereo
 from gaussians.rotations import rotations_from_quaternions
 from gaussians.scene import FIELDS, Scene, concatenate
-from gaussians.stereo import PRESETS
+from gaussians.stereo_method import PRESETS
 from gaussians.transforms import transformed
 from tests.gaussians.real_data import data_file
 from tests.strategies import KINDS, build_case, rigs, small_rig

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from gaussians import parallel, reference
 from gaussians.render import StereoFrame, render_mono, render_stereo
-from gaussians.stereo import PRESETS
+from gaussians.stereo_method import PRESETS
 from gaussians.work import EyeWork
 from tests import strategies
 from tests.naive.tiling import necessary_lists, nested, passing_pixels, recount

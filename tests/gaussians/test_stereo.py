@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gaussians import reference
 from gaussians.cameras import StereoRig
 from gaussians.render import StereoFrame, render_stereo
-from gaussians.stereo import PRESETS
+from gaussians.stereo_method import PRESETS
 from gaussians.work import StereoWork
 from tests import strategies
 from tests.naive.stereo import carry

@@ -14,7 +14,7 @@ from gaussians.cameras import Display, StereoRig
 from gaussians.errors import InputError
 from gaussians.quality import to_8bit
 from gaussians.render import render_stereo
-from gaussians.stereo import PRESETS
+from gaussians.stereo_method import PRESETS
 from gaussians.synthetic import generate_city
 from lod_cloud import load_tree
 from nebula import build_tree, render, search
