@@ -55,7 +55,7 @@ class Attribution:
 
     def attribute(self, method: StereoMethod, right: Float32) -> CauseMap:
         """Causes of the wrong pixels of ``right`` [H, W, 3], the right eye by ``method``."""
-        reference = self._renderer.independent_right()
+        reference = self._renderer.independent_right().image
         wrong, visibly = differing(right, reference), error_8bit(right, reference) > 0
         causes = causes_of(method)
         shape = wrong.shape
@@ -98,7 +98,7 @@ class Attribution:
         """[H, W] where the right eye by ``method`` has other bits than the independent one."""
         if method not in self._wrong:
             right = self._renderer.render(method).right
-            reference = self._renderer.independent_right()
+            reference = self._renderer.independent_right().image
             self._wrong[method] = differing(right, reference)
             self._errors[method] = error_8bit(right, reference)
         return self._wrong[method]

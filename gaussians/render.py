@@ -56,12 +56,12 @@ class StereoRenderer:
         self._splats = project(scene, rig)
         self._rows: dict[tuple[Intersection, bool], _Binned] = {}
         self._lefts: dict[tuple[Intersection, bool, bool], LeftEye] = {}
-        self._reference: Float32 | None = None
+        self._reference: EyeImage | None = None
 
-    def independent_right(self) -> Float32:
-        """[H, W, 3] the right eye from its own projection and its own ellipse lists."""
+    def independent_right(self) -> EyeImage:
+        """The right eye from its own projection and its own ellipse lists."""
         if self._reference is None:
-            self._reference = self._own_right("ellipse").image
+            self._reference = self._own_right("ellipse")
         return self._reference
 
     def render(self, method: StereoMethod, *, compare: bool = False) -> StereoFrame:
@@ -92,7 +92,7 @@ class StereoRenderer:
             self._splats.ids,
             _frame_work(self._scene, method, self._splats, binned, left, right, forwarding),
             binned.in_eyes,
-            self.independent_right() if compare else None,
+            self.independent_right().image if compare else None,
         )
 
     def _binned(self, intersection: Intersection, wide: bool = False) -> _Binned:

@@ -187,6 +187,52 @@ def render(json_target: str | None, **values: Any) -> None:
 
 
 @cli.command()
+@scene_options
+@seed_option
+@view_options
+@baseline_option
+@click.option("--trace", metavar="NAME|CSV", help="Verify along a head trace, not the view alone.")
+@click.option("--frames", type=COUNT, help="Of the trace.  [default: 12 with --trace, else 1]")
+@click.option("--ladder", is_flag=True, help="From paper to exact, one fix after the other.")
+@click.option("--isolate", is_flag=True, help="Exact with one defect at a time.")
+@click.option("--hostile", is_flag=True, help="Paper and exact on scenes built to break them.")
+@click.option(
+    "--method",
+    "methods",
+    multiple=True,
+    metavar="PRESET[,SWITCH=VALUE...]",
+    help="Such as paper,rows=8; may be given several times.  [default: paper and exact]",
+)
+@click.option(
+    "--tile",
+    "tile_px",
+    type=click.Choice(["4", "8", "16"]),
+    default="4",
+    show_default=True,
+    help="Tile edge, pixels.",
+)
+@threads_option
+@out_option("out/verify")
+@json_option
+def verify(json_target: str | None, **values: Any) -> None:
+    """Check stereo methods against an independent right eye, and say why pixels are wrong."""
+    from nebula.options import VerifyOptions
+
+    modes = [mode for mode in ("ladder", "isolate", "hostile") if values.pop(mode)]
+    if len(modes) > 1 or (modes and values["methods"]):
+        raise InputError("--ladder, --isolate, --hostile and --method exclude each other")
+    values["mode"] = modes[0] if modes else None
+    if modes == ["hostile"]:
+        idle = [key for key in (*_SCENE_KEYS, "config", "frames") if values.get(key) is not None]
+        if idle:
+            raise InputError(f"--hostile brings its own scenes; {', '.join(idle)}: not of use")
+    values["moving"] = values["trace"] is not None or (values["frames"] or 1) > 1
+    values["frames"] = values["frames"] or (12 if values["moving"] else 1)
+    values["tile_px"] = int(values["tile_px"])
+    _execute("verify", VerifyOptions, values, json_target)
+
+
+@cli.command()
 @click.argument("file", required=False)
 @scene_options
 @seed_option

@@ -103,6 +103,21 @@ class RenderOptions:
 
 
 @dataclass(frozen=True)
+class VerifyOptions:
+    """``nebula verify``: the right eye by stereo methods against an independent one."""
+
+    scene: SceneOptions
+    seed: int
+    baseline_m: float
+    moving: bool  # along the scene's trace; else the view alone
+    frames: int
+    mode: Literal["ladder", "isolate", "hostile"] | None
+    methods: tuple[str, ...]  # without a mode; see gaussians.stereo_method.parse_method
+    tile_px: int
+    out: Path
+
+
+@dataclass(frozen=True)
 class InfoOptions:
     """``nebula info``: what is in a scene."""
 

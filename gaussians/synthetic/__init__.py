@@ -1,6 +1,15 @@
-"""Seeded synthetic scenes: a city to walk through, and benchmark views with known statistics."""
+"""Seeded synthetic scenes: a city to walk through, benchmark views with known statistics, and
+hostile cases for stereo methods."""
 
 from gaussians.synthetic.city import City, generate_city
+from gaussians.synthetic.hostile import HOSTILE, HostileCase
 from gaussians.synthetic.views import BenchmarkView, benchmark_scene
 
-__all__ = ["BenchmarkView", "City", "benchmark_scene", "generate_city"]
+__all__ = [
+    "HOSTILE",
+    "BenchmarkView",
+    "City",
+    "HostileCase",
+    "benchmark_scene",
+    "generate_city",
+]

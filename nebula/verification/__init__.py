@@ -1,0 +1,1 @@
+"""What `nebula verify` measures, attributes, draws and writes."""
