@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,11 +17,17 @@ from gaussians.stereo_causes import CAUSES, isolated, ladder
 from gaussians.stereo_method import PRESETS, StereoMethod, parse_method
 from gaussians.synthetic import HOSTILE
 from nebula.options import VerifyOptions
-from nebula.output import CommandResult, OutputDirectory, text_table
+from nebula.output import CommandResult, OutputDirectory
 from nebula.progress import progress
 from nebula.scene_input import describe_files, head_trace, load, require_visible
 from nebula.verification.chart import MissingReportExtra, accuracy_against_work
 from nebula.verification.pictures import cause_map, difference_map, side_by_side
+from nebula.verification.tables import (
+    csv_table,
+    hostile_markdown,
+    markdown_table,
+    terminal_table,
+)
 from nebula.verification.tally import MethodTally
 
 # Both eyes on their own, by each kind of list: what sharing has to beat.
@@ -50,7 +54,7 @@ class _Subject:
 
 
 def run(options: VerifyOptions) -> CommandResult:
-    """Write verify.json, verify.csv, chart.png and the pictures of the first view."""
+    """Write verify.json, .csv and .md, chart.png and the pictures of the first view."""
     methods = _methods(options)
     with OutputDirectory(options.out) as out:
         subjects = list(_subjects(options))
@@ -76,8 +80,11 @@ def run(options: VerifyOptions) -> CommandResult:
         missing = sorted(set(missing))
         data = _describe(options, subjects, rows, baselines, missing)
         out.write_json("verify.json", data)
-        out.write_text("verify.csv", _csv([*rows, *baselines]))
-    lines = (_table([*rows, *baselines]), *missing, str(options.out / "verify.json"))
+        every_row = [*rows, *baselines]
+        out.write_text("verify.csv", csv_table(every_row))
+        markdown = markdown_table if alone else hostile_markdown
+        out.write_text("verify.md", markdown(every_row))
+    lines = (terminal_table(every_row), *missing, str(options.out / "verify.json"))
     return CommandResult(data, "\n".join(lines))
 
 
@@ -183,42 +190,3 @@ def _describe(
         "baselines": baselines,
         "missing": missing,
     }
-
-
-def _csv(rows: Sequence[dict[str, Any]]) -> str:
-    """One line per row; a cause's pixels, in float32 and in 8 bit, in columns of their own."""
-    plain = [key for key in rows[0] if key != "causes"]
-    labels = [label for label in LABELS if any(label in row["causes"] for row in rows)]
-    causes = [f"{label}_{unit}" for label in labels for unit in ("pixels", "pixels_8bit")]
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow([*plain, *causes])
-    for row in rows:
-        counts = [
-            row["causes"].get(label, {}).get(unit, 0)
-            for label in labels
-            for unit in ("pixels", "pixels_8bit")
-        ]
-        writer.writerow([*(row[key] for key in plain), *counts])
-    return stream.getvalue()
-
-
-def _table(rows: Sequence[dict[str, Any]]) -> str:
-    heads = ("", "differ", "in 8 bit", "PSNR dB", "inserted", "checks", "main cause")
-    lines = []
-    several = len({row["scene"] for row in rows}) > 1
-    for row in rows:
-        counts = {name: c["pixels_8bit"] or c["pixels"] for name, c in row["causes"].items()}
-        wrong = row["mismatching_pixels"]
-        lines.append(
-            (
-                f"{row['scene']}: {row['method']}" if several else row["method"],
-                f"{wrong / row['pixels']:.3%}" if wrong else "0",
-                f"{row['mismatching_pixels_8bit'] / row['pixels']:.3%}" if wrong else "0",
-                "identical" if row["psnr_db"] is None else f"{row['psnr_db']:.1f}",
-                f"{row['inserted'] / 1e6:.2f} M",
-                f"{row['alpha_checks'] / 1e6:.1f} M",
-                max(counts, key=lambda name: counts[name]) if wrong else "",
-            )
-        )
-    return text_table(heads, lines, (1, 2, 3, 4, 5))
