@@ -51,8 +51,9 @@ def at_pixel(rig: StereoRig, column: float, row: float, depth: float) -> tuple[f
 def _anywhere(rng: Generator, rig: StereoRig, depth: float) -> tuple[float, float, float]:
     """A point somewhere around the union of both windows."""
     d = rig.display
-    reach = d.window_offset_px + rig.baseline_m * d.fx / depth
-    column = rng.uniform(-0.3 * d.width, 1.3 * d.width + reach)
+    offset = d.window_offset_px
+    reach = max(offset, 0.0) + rig.baseline_m * d.fx / depth
+    column = rng.uniform(min(offset, 0.0) - 0.3 * d.width, 1.3 * d.width + reach)
     return at_pixel(rig, column, rng.uniform(-0.2, 1.2) * d.height, depth)
 
 
@@ -222,6 +223,18 @@ def whole_tiles_of_disparity(rng: Generator, rig: StereoRig) -> list[Splat]:
     return splats
 
 
+def thin_lines(rng: Generator, rig: StereoRig) -> list[Splat]:
+    """Faint upright lines between left pixel columns; most meet a column in the right eye."""
+    splats = []
+    for _ in range(4):
+        column, disparity = float(rng.integers(0, rig.display.width + 8)), rng.integers(1, 20) + 0.5
+        depth = max(rig.baseline_m * rig.display.fx / disparity, rig.near_m)
+        position = at_pixel(rig, column, rng.uniform(0, rig.display.height), depth)
+        length = rng.uniform(1.0, 10.0) * depth / rig.display.fx
+        splats.append(Splat(position, (0.0, length, 0.0), float(OPACITY_EDGE) * 1.2))
+    return splats
+
+
 def outliers(rng: Generator, rig: StereoRig) -> list[Splat]:
     """Far away, far aside, and enormous."""
     return [
@@ -250,6 +263,7 @@ KINDS: dict[str, Callable[[Generator, StereoRig], list[Splat]]] = {
         left_of_the_left_image,
         between_centres,
         whole_tiles_of_disparity,
+        thin_lines,
         outliers,
     )
 }
@@ -321,7 +335,7 @@ def rigs() -> st.SearchStrategy[StereoRig]:
         st.sampled_from([37, 40, 16, 4, 1]),
         st.sampled_from([29, 16, 40, 5, 1]),
         focal=st.sampled_from([(32.0, 32.0), (64.0, 64.0), (37.3, 41.9), (16.0, 20.0)]),
-        offset_px=st.sampled_from([0, 16, 48]),
+        offset_px=st.sampled_from([0, 16, 48, -16, -48]),
         baseline_m=st.sampled_from([0.0625, 0.06, 0.6, 0.0]),
         pose=st.one_of(st.just(ORIGIN), st.integers(0, 999).map(turned_pose)),
     )

@@ -15,7 +15,6 @@ from gaussians.cameras import StereoRig
 from tests.strategies import (
     OPACITY_EDGE,
     ORIGIN,
-    UPRIGHT,
     Case,
     Splat,
     at_pixel,
@@ -23,8 +22,6 @@ from tests.strategies import (
     small_rig,
     turned_pose,
 )
-
-Quaternion = tuple[float, ...]
 
 _ZERO, _BIG = np.float32(0), np.float32(1e9)
 OPACITIES = (
@@ -71,29 +68,33 @@ def coordinates(low: int, high: int) -> st.SearchStrategy[float]:
 
 
 @st.composite
-def shapes(
-    draw: st.DrawFn, position: tuple[float, float, float], rig: StereoRig
-) -> tuple[tuple[float, float, float], Quaternion]:
-    """Scales in metres and a quaternion."""
-    pixel = abs(position[2]) / rig.display.fx
+def splats_at(draw: st.DrawFn, position: tuple[float, float, float], rig: StereoRig) -> Splat:
+    """One splat of any shape at or, if a needle, through this position."""
+    x, y, z = position
+    pixel, opacity = z / rig.display.fx, draw(st.sampled_from(OPACITIES))
     kind = draw(st.sampled_from(["dot", "ball", "upright line", "needle", "edge-on", "huge"]))
     if kind == "dot":
-        return (0.0, 0.0, 0.0), UPRIGHT
+        return Splat(position, (0.0, 0.0, 0.0), opacity)
     if kind == "ball":
         size = draw(st.sampled_from([0.3, 1.0, 5.0])) * pixel
-        return (size, size, size), UPRIGHT
+        return Splat(position, (size, size, size), opacity)
     if kind == "upright line":
-        return (0.0, draw(st.sampled_from([1.0, 10.0, 1000.0])) * pixel, 0.0), UPRIGHT
+        length = draw(st.sampled_from([1.0, 10.0, 1000.0])) * pixel
+        return Splat(position, (0.0, length, 0.0), opacity)
     if kind == "needle":
-        length, half = 10.0 ** draw(st.integers(1, 5)) * pixel, draw(st.sampled_from(ANGLES)) / 2
-        return (length, 0.0, 0.0), (np.cos(half), 0.0, 0.0, np.sin(half))
+        length, angle = 10.0 ** draw(st.integers(1, 5)) * pixel, draw(st.sampled_from(ANGLES))
+        away = draw(st.sampled_from([0.0, -1.5, 0.5, 2.0])) * length  # still through the position
+        centre = x + away * np.cos(angle), y + away * np.sin(angle), z
+        turn = (np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2))
+        return Splat(centre, (length, 0.0, 0.0), opacity, turn)
     if kind == "edge-on":  # a disc that holds the left eye's ray to its centre
-        half = np.arctan2(-position[2], position[0] + 0.5 * rig.baseline_m) / 2
+        half = np.arctan2(-z, x + 0.5 * rig.baseline_m) / 2
         size = 10.0 ** draw(st.integers(-2, 1))
-        return (size, 0.1 * size, 0.0), (np.cos(half), 0.0, np.sin(half), 0.0)
-    turn = np.random.default_rng(draw(st.integers(0, 99))).normal(size=4)
-    scales = [10.0 ** draw(st.integers(-3, 6)) for _ in range(3)]
-    return (scales[0], scales[1], scales[2]), tuple(turn / np.linalg.norm(turn))
+        turn = (np.cos(half), 0.0, np.sin(half), 0.0)
+        return Splat(position, (size, 0.1 * size, 0.0), opacity, turn)
+    anyhow = np.random.default_rng(draw(st.integers(0, 99))).normal(size=4)
+    a, b, c = (10.0 ** draw(st.integers(-3, 6)) for _ in range(3))
+    return Splat(position, (a, b, c), opacity, tuple(anyhow / np.linalg.norm(anyhow)))
 
 
 @st.composite
@@ -105,16 +106,25 @@ def splats(draw: st.DrawFn, rig: StereoRig) -> Splat:
     if draw(st.booleans()):  # meant for the right window
         column += shift
     row = draw(coordinates(-4, display.height + 4))
-    position = at_pixel(rig, column, row, depth)
-    scales, quaternion = draw(shapes(position, rig))
-    return Splat(position, scales, draw(st.sampled_from(OPACITIES)), quaternion)
+    return draw(splats_at(at_pixel(rig, column, row, depth), rig))
+
+
+@st.composite
+def walls(draw: st.DrawFn, rig: StereoRig) -> list[Splat]:
+    """Nothing, or three opaque balls in one place: pixels and tiles behind them stop."""
+    if not draw(st.booleans()):
+        return []
+    depth = draw(depths(rig))
+    column, row = draw(coordinates(0, rig.display.width)), draw(coordinates(0, rig.display.height))
+    size = draw(st.sampled_from([1.0, 4.0, 20.0])) * depth / rig.display.fx
+    return 3 * [Splat(at_pixel(rig, column, row, depth), (size, size, size), 44.0)]
 
 
 @st.composite
 def threshold_cases(draw: st.DrawFn) -> Case:
-    """One to twelve splats of random colours."""
+    """One to twelve splats of random colours, with or without a wall."""
     rig = draw(rigs())
-    chosen = draw(st.lists(splats(rig), min_size=1, max_size=12))
+    chosen = draw(walls(rig)) + draw(st.lists(splats(rig), min_size=1, max_size=12))
     degree = draw(st.sampled_from([0, 1, 3]))
     rng = np.random.default_rng(len(chosen))
     sh = rng.normal(0.0, 0.5, (len(chosen), (degree + 1) ** 2, 3))

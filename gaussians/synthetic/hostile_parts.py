@@ -12,7 +12,8 @@ from gaussians.scene import Scene, normalised_quaternions
 Float64 = NDArray[np.float64]
 
 ORIGIN = Pose(np.zeros(3), np.eye(3))
-F_PX, BASELINE_M = 128.0, 0.0625  # disparity 8 / z px: exact for round numbers
+F_PX, BASELINE_M = 128.0, 0.0625
+BF = F_PX * BASELINE_M  # disparity times depth: 8 px m, exact for round numbers
 
 
 def straight_rig(

@@ -15,6 +15,8 @@ from gaussians.projection import project
 from gaussians.render import render_stereo
 from gaussians.stereo_method import PRESETS
 from gaussians.tiling import TileGrid, TileLists, row_spans, tile_lists
+from tests.gaussians.hostile_frames import pairs
+from tests.gaussians.test_stereo import assert_the_carrier_rule_explains
 from tests.strategies import Case
 from tests.threshold_cases import threshold_cases
 
@@ -41,7 +43,11 @@ def right_eye_alone(case: Case, tile_px: int) -> TileLists:
 
 
 def assert_exact_is_exact(case: Case, tile_px: int) -> None:
-    """Against the preset `independent`, the right eye on its own, and the slow renderer."""
+    """Against the preset `independent`, the right eye on its own, and the slow renderer.
+
+    Both presets bin a splat in the rows that it may reach in either eye. On its own, the right eye
+    may leave out a row of a splat whose height float32 has lost in the left eye.
+    """
     scene, rig, background = case.scene, case.rig, case.background
     exact = render_stereo(scene, rig, PRESETS["exact"], background, tile_px, compare=True)
     independent = render_stereo(scene, rig, PRESETS["independent"], background, tile_px)
@@ -51,11 +57,12 @@ def assert_exact_is_exact(case: Case, tile_px: int) -> None:
     assert_same_bits(exact.right, reference.render_eye(scene, rig, "right", background).image)
     assert_same_lists(exact.left_lists, independent.left_lists)
     assert_same_lists(exact.right_lists, independent.right_lists)
-    assert_same_lists(exact.right_lists, right_eye_alone(case, tile_px))
+    assert pairs(right_eye_alone(case, tile_px)) <= pairs(exact.right_lists)
     assert exact.work.stereo.duplicates == exact.work.stereo.dropped == 0
+    assert_the_carrier_rule_explains(case, tile_px)
 
 
-@settings(max_examples=250)
+@settings(max_examples=200)
 @given(threshold_cases(), TILES)
 def test_exact_is_exact_on_the_thresholds(case: Case, tile_px: int) -> None:
     assert_exact_is_exact(case, tile_px)
@@ -117,7 +124,7 @@ def reached(case: Case) -> set[str]:
 def test_the_drawings_reach_what_they_are_meant_to() -> None:
     found: set[str] = set()
 
-    @settings(max_examples=250)
+    @settings(max_examples=150)
     @given(threshold_cases())
     def look(case: Case) -> None:
         found.update(reached(case))

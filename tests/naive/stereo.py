@@ -34,8 +34,9 @@ def carry(
     """
     tiles_y, left_width, right_width = len(left), len(left[0]), len(right[0])
     plane_width = max(left_width, right_width + offset_tiles)
+    lowest = min(0, offset_tiles)  # the plane begins with the window further left
     fifos: dict[tuple[int, int, int], list[int]] = {}
-    forward_only = np.zeros((tiles_y, plane_width), np.int32)
+    forward_only = np.zeros((tiles_y, plane_width - lowest), np.int32)
     for y in range(tiles_y):
         for t in range(right_width):
             for splat in right[y][t]:
@@ -43,7 +44,7 @@ def carry(
                 c = carrier(t + offset_tiles, int(disparity_tiles[splat]), span, rows, plane_width)
                 fifos.setdefault((c - t - offset_tiles, y, t), []).append(splat)
                 if c not in span:
-                    forward_only[y, c] += 1
+                    forward_only[y, c - lowest] += 1
     entries = np.zeros((rows, tiles_y, right_width), np.int32)
     for key, queue in fifos.items():
         entries[key] = len(queue)
