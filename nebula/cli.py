@@ -19,6 +19,7 @@ from typing import Any, NoReturn, TypeVar
 import click
 
 from gaussians.errors import InputError
+from nebula.figures import FIGURES
 from nebula.output import STDOUT, CommandResult, check_json_target, write_json
 
 SUCCESS, INTERNAL_ERROR, USER_ERROR, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
@@ -334,6 +335,32 @@ def energy(json_target: str | None, **values: Any) -> None:
     from nebula.options import EnergyOptions
 
     _execute("energy", EnergyOptions, values, json_target)
+
+
+@cli.command(
+    epilog="\b\nFigures:\n" + "\n".join(f"  {n:<18} {about}" for n, (_, about) in FIGURES.items())
+)
+@click.argument("name", metavar="NAME")
+@scene_options
+@seed_option
+@view_options
+@baseline_option
+@threads_option
+@out_option(None)
+@json_option
+def figure(
+    name: str, config: str | None, json_target: str | None, threads: int | None, **values: Any
+) -> None:
+    """Measure a figure; write NAME.json, NAME.csv and NAME.png.
+
+    Without a scene it measures its own few; real ones are looked for in $NEBULA_DATA. The display
+    is then the prototype's 2064 x 2208 pixels, unless one is given.
+    """
+    from nebula.options import FigureOptions
+
+    given = {key: values.pop(key) for key in _SCENE_KEYS if key in values}
+    values |= {"name": name, "config": config, "given": given, "threads": threads}
+    _execute("figure", FigureOptions, values, json_target)
 
 
 _VIEW_KEYS = ("view", "fov_deg", "width", "height", "display")

@@ -175,7 +175,21 @@ class EnergyOptions:
     report: Path | None
 
 
-def scene_options(config: str | None, given: Mapping[str, Any]) -> SceneOptions:
+@dataclass(frozen=True)
+class FigureOptions:
+    """``nebula figure``: one figure, of the scene the command line names or of its own few."""
+
+    name: str
+    config: str | None
+    given: Mapping[str, Any]  # as for ``scene_options``; without a scene it places the figure's own
+    seed: int
+    baseline_m: float
+    out: Path
+
+
+def scene_options(
+    config: str | None, given: Mapping[str, Any], *, default_display: str | None = None
+) -> SceneOptions:
     """Command line over configuration file over defaults.
 
     Parameters
@@ -183,6 +197,8 @@ def scene_options(config: str | None, given: Mapping[str, Any]) -> SceneOptions:
     config : a shipped name of configs/scenes/ or a YAML file; None for no file.
     given : values by field of ``SceneConfig``, and ``city_leaves``; None where the command line is
         silent. ``scene`` and ``trace`` are relative to the current folder.
+    default_display : preset where neither says anything of the display; None: 1024 x 1024, 96
+        degrees.
 
     Raises InputError for a file that is not there and for values that contradict each other.
     """
@@ -211,7 +227,7 @@ def scene_options(config: str | None, given: Mapping[str, Any]) -> SceneOptions:
         units_per_metre=_default(chosen["units_per_metre"], 1.0),
         view=chosen["view"],
         near_m=_default(chosen["near_m"], NEAR_M),
-        display=_display(given, file),
+        display=_display(given, file, default_display),
         trace=trace,
     )
 
@@ -234,7 +250,7 @@ def _benchmark(mapping: dict[str, Any], name: str) -> tuple[BenchmarkView, Scene
     return view, SceneConfig(display=view.display, near_m=view.near_m)
 
 
-def _display(given: Mapping[str, Any], file: SceneConfig) -> Display:
+def _display(given: Mapping[str, Any], file: SceneConfig, default: str | None) -> Display:
     """A preset, or width, height and field of view; the command line's kind replaces the file's."""
     names = ("width", "height", "fov_deg")
     sized = [name for name in names if name in given]
@@ -242,7 +258,10 @@ def _display(given: Mapping[str, Any], file: SceneConfig) -> Display:
         raise InputError(
             f"--display {given['display']} fixes {', '.join(sized)}; give one or the other"
         )
+    sized_by_file = any(getattr(file, name) is not None for name in names)
     preset = given.get("display") or (None if sized else file.display)
+    if preset is None and not sized and not sized_by_file:
+        preset = default
     if preset is not None:
         if preset not in DISPLAYS:
             raise InputError(f"display must be one of {', '.join(DISPLAYS)}, not '{preset}'")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -161,7 +161,7 @@ def _method(options: SimulateOptions, hardware: Hardware) -> StereoMethod:
     workload = hardware.config.workload
     method = PRESETS[options.method or workload.stereo_method]
     if method.forwarding == "none":
-        return StereoMethod(method.name, method.forwarding, workload.intersection)
+        return replace(method, intersection=workload.intersection)
     if hardware.config.stereo is None:
         raise InputError(
             f"{hardware.config.name}: has no stereo units; --method must be 'independent', "

@@ -119,8 +119,8 @@ _STEREO = (
         "stereo.right_mismatching_pixels",
         "integer",
         "pixels",
-        "Right-eye pixels whose float32 bits differ from an independently rendered right eye, "
-        "summed over the frames",
+        "Right-eye pixels whose float32 bits differ from an independently rendered right eye with "
+        "ellipse lists, summed over the frames",
     ),
     Key(
         "stereo.right_mismatching_pixels_8bit",

@@ -28,12 +28,14 @@ from nebula.progress import progress
 COMMANDS = {
     "simulate": ([], "SimulateOptions"),
     "render": ([], "RenderOptions"),
+    "verify": ([], "VerifyOptions"),
     "info": ([], "InfoOptions"),
     "convert": (["in.sog", "out.ply"], "ConvertOptions"),
     "build-tree": (["--out", "tree"], "BuildTreeOptions"),
     "search": (["--tree", "tree"], "SearchOptions"),
     "area": ([], "AreaOptions"),
     "energy": ([], "EnergyOptions"),
+    "figure": (["formats", "--out", "figures"], "FigureOptions"),
 }
 
 Run = Callable[..., tuple[int, str, str]]

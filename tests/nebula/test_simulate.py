@@ -109,7 +109,9 @@ def test_gscore_renders_independent_eyes_from_its_own_lists(tmp_path):
     report = run(options(tmp_path, accelerator="gscore_nebula")).data
     assert report["stereo"]["method"] == "independent"
     assert "obb" in report["stereo"]["description"]
-    assert report["stereo"]["right_mismatching_pixels"] == 0
+    # what its three-sigma boxes cut off: judged against ellipse lists, as every method is
+    assert report["stereo"]["right_mismatching_pixels"] > 0
+    assert report["stereo"]["psnr_db"] > 50
     assert "stereo_reprojection_unit" not in report["area"]["parts"]
 
 
