@@ -32,7 +32,7 @@ class TileSize(Provenance):
 
 @dataclass(frozen=True)
 class Workload:
-    """What the functional level must render for this accelerator (names of gaussians.stereo_method)."""
+    """What the functional level must render for this accelerator (see gaussians.stereo_method)."""
 
     stereo_method: str
     intersection: Literal["ellipse", "square_3sigma", "obb"]

@@ -4,9 +4,12 @@ Called from kernels in other files; see kernel_cache.py for what that asks of th
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
+
+from gaussians.lanes import scaled
 
 _LOG2_E = np.float32(1.4426950408889634)
 _LN2_HIGH = np.float32(0.693359375)  # 9 significant bits: k * _LN2_HIGH is exact for |k| < 2**15
@@ -19,18 +22,17 @@ _E4 = np.float32(0.041666463)
 _E5 = np.float32(0.008363236)
 _E6 = np.float32(0.0013933734)
 _ONE = np.float32(1.0)
-_BIAS = np.int32(127)
-_SHIFT = np.int32(23)
 
 
 @njit(inline="always")
-def exp_float32(p: np.float32) -> np.float32:
-    """exp(p) for -87 < p <= 0, float32, within 2 ulp; operation order in conventions.md."""
-    k = (p * _LOG2_E + _ROUND) - _ROUND
+def exp_float32(p: Any) -> Any:
+    """exp(p) for -87 < p <= 0, one float32 or `Lanes`, within 2 ulp; operation order in
+    conventions.md."""
+    shifted = p * _LOG2_E + _ROUND
+    k = shifted - _ROUND
     r = (p - k * _LN2_HIGH) - k * _LN2_LOW
     poly = (((_E6 * r + _E5) * r + _E4) * r + _E3) * r + _E2
-    value = (poly * (r * r) + r) + _ONE
-    return value * np.int32((np.int32(k) + _BIAS) << _SHIFT).view(np.float32)
+    return scaled((poly * (r * r) + r) + _ONE, shifted)
 
 
 _SQRT_HALF = 0.7071067811865476

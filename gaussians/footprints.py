@@ -1,9 +1,11 @@
 """Footprints: the image-space shapes by which a splat is binned, and their cuts with a tile row.
 
 ``ellipse``: the opacity-aware contour p = threshold, widened by the rounding bound of
-conventions.md. ``square_3sigma``: INRIA's square of radius ceil(3 sigma_max). ``obb``: GSCore's
-oriented box of three sigmas. The last two drop contributions that the ellipse keeps: an opacity of
-1 reaches 1/255 only at 3.33 sigma. Arithmetic is float64 on the float32 conic and covariance.
+conventions.md. ``box``: its axis-aligned bounding box, sqrt(2 q cxx) by sqrt(2 q cyy) to either
+side for q = -threshold but for that widening; it holds every tile of the ellipse.
+``square_3sigma``: INRIA's square of radius ceil(3 sigma_max). ``obb``: GSCore's oriented box of
+three sigmas. These two drop contributions that the ellipse keeps: an opacity of 1 reaches 1/255
+only at 3.33 sigma. Arithmetic is float64 on the float32 conic and covariance.
 
 A footprint is prepared once per splat and eye into six numbers, whose meaning depends on the rule.
 Called from kernels in other files; see kernel_cache.py.
@@ -16,19 +18,15 @@ from typing import Literal, get_args
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from gaussians.constants import CONIC_A, CONIC_B, CONIC_C, THRESHOLD
-
-Float32 = NDArray[np.float32]
-Intersection = Literal["ellipse", "square_3sigma", "obb"]
+Intersection = Literal["ellipse", "square_3sigma", "obb", "box"]
 INTERSECTIONS: tuple[str, ...] = get_args(Intersection)
-ELLIPSE, SQUARE, BOX = range(3)
+ELLIPSE, SQUARE, OBB, BOX = range(4)
 
 Shape = tuple[float, float, float, float, float, float]
 _SLOPE, _INVERSE, _REACH, _DET, _TOP, _WIDEST = range(6)  # ellipse
-_RADIUS = 0  # square
-_X1, _Y1, _X2, _Y2 = range(4)  # box: half axes (x1, y1) and (x2, y2)
+_HALF_WIDTH, _HALF_HEIGHT = range(2)  # square, box
+_X1, _Y1, _X2, _Y2 = range(4)  # oriented box: half axes (x1, y1) and (x2, y2)
 
 _ROUNDING = 16.0 * 2.0**-24  # bound on p's float32 rounding, relative, see conventions.md
 _SIGMAS = 3.0  # INRIA and GSCore: splats are cut at three standard deviations
@@ -37,13 +35,12 @@ _EMPTY = (1.0, -1.0)
 
 
 @njit(cache=True, error_model="numpy")
-def _ellipse(feature: Float32) -> tuple[float, Shape]:
+def _ellipse(a: float, b: float, c: float, threshold: float) -> tuple[float, Shape]:
     """With a, c widened by the rounding bound and q = -threshold, the boundary over dy is
     (-b dy -+ sqrt(2 q a - det dy^2)) / a; it is widest to the right at dy = WIDEST."""
-    a = np.float64(feature[CONIC_A]) * (1.0 - _ROUNDING)
-    b = np.float64(feature[CONIC_B])
-    c = np.float64(feature[CONIC_C]) * (1.0 - _ROUNDING)
-    two_q = -2.0 * np.float64(feature[THRESHOLD])
+    a *= 1.0 - _ROUNDING
+    c *= 1.0 - _ROUNDING
+    two_q = -2.0 * threshold
     det = a * c - b * b
     top, widest = np.inf, 0.0
     if two_q < 0.0:
@@ -55,21 +52,31 @@ def _ellipse(feature: Float32) -> tuple[float, Shape]:
 
 
 @njit(cache=True, error_model="numpy")
-def footprint(rule: int, feature: Float32, covariance: Float32) -> tuple[float, Shape]:
+def footprint(
+    rule: int,
+    conic: tuple[float, float, float],
+    threshold: float,
+    covariance: tuple[float, float, float],
+) -> tuple[float, Shape]:
     """Half height in px, negative if empty and infinite if unbounded, and the shape.
 
-    An ellipse is unbounded where rounding leaves it so (condition number about 1e6 and above).
+    ``conic`` is (A, B, C), ``covariance`` (cxx, cxy, cyy). An ellipse and its box are unbounded
+    where rounding leaves them so (condition number about 1e6 and above).
     """
+    a, b, c = conic
     if rule == ELLIPSE:
-        return _ellipse(feature)
-    cxx, cxy = np.float64(covariance[0]), np.float64(covariance[1])
-    cyy = np.float64(covariance[2])
+        return _ellipse(a, b, c, threshold)
+    if rule == BOX:
+        half_height, _shape = _ellipse(a, b, c, threshold)
+        half_width, _shape = _ellipse(c, b, a, threshold)
+        return half_height, (half_width, half_height, 0.0, 0.0, 0.0, 0.0)
+    cxx, cxy, cyy = covariance
     middle = 0.5 * (cxx + cyy)
     square_root_of = middle * middle - (cxx * cyy - cxy * cxy)
     if rule == SQUARE:  # INRIA's floor of 0.1 under the root
         largest = middle + math.sqrt(max(0.1, square_root_of))
         radius = np.ceil(_SIGMAS * math.sqrt(largest))
-        return radius, (radius, 0.0, 0.0, 0.0, 0.0, 0.0)
+        return radius, (radius, radius, 0.0, 0.0, 0.0, 0.0)
     spread = math.sqrt(max(0.0, square_root_of))
     angle = 0.5 * math.atan2(2.0 * cxy, cxx - cyy)
     long_axis = _SIGMAS * math.sqrt(middle + spread)
@@ -101,7 +108,7 @@ def _ellipse_interval(shape: Shape, low: float, high: float) -> tuple[float, flo
 
 
 @njit(cache=True, error_model="numpy")
-def _box_interval(shape: Shape, low: float, high: float) -> tuple[float, float]:
+def _oriented_box_interval(shape: Shape, low: float, high: float) -> tuple[float, float]:
     """Corners inside the slab, and edges cut by its two lines."""
     x1, y1, x2, y2 = shape[_X1], shape[_Y1], shape[_X2], shape[_Y2]
     left, right = _FAR_PX, -_FAR_PX
@@ -130,8 +137,8 @@ def footprint_interval(rule: int, shape: Shape, low: float, high: float) -> tupl
     """
     if rule == ELLIPSE:
         return _ellipse_interval(shape, low, high)
-    if rule == BOX:
-        return _box_interval(shape, low, high)
-    if low >= shape[_RADIUS] or high <= -shape[_RADIUS]:
+    if rule == OBB:
+        return _oriented_box_interval(shape, low, high)
+    if low >= shape[_HALF_HEIGHT] or high <= -shape[_HALF_HEIGHT]:
         return _EMPTY
-    return -shape[_RADIUS], shape[_RADIUS]
+    return -shape[_HALF_WIDTH], shape[_HALF_WIDTH]

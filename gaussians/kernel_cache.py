@@ -13,7 +13,10 @@ from pathlib import Path
 SHARED_SOURCES = (
     "gaussians/float32_math.py",
     "gaussians/footprints.py",
+    "gaussians/lanes.py",
     "lod_cloud/criterion.py",
+    "lod_cloud/search/marks.py",
+    "lod_cloud/search/sectors.py",
 )
 
 

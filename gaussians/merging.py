@@ -15,20 +15,6 @@ from gaussians.tiling import TileLists, offsets_of
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _sort_last_row(
-    begin: int,
-    end: int,
-    starts: NDArray[np.int64],
-    ends: NDArray[np.int64],
-    fifo: NDArray[np.int32],
-) -> None:
-    last = starts.shape[2] - 1
-    for row in range(begin, end):
-        for column in range(starts.shape[1]):
-            fifo[starts[row, column, last] : ends[row, column, last]].sort()
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
 def _merge(
     begin: int,
     end: int,
@@ -80,28 +66,26 @@ def merge_rows(
     ends: NDArray[np.int64],
     fifo: NDArray[np.int32],
     depths: NDArray[np.float32] | None = None,
-    spill: bool = False,
 ) -> tuple[TileLists, int]:
     """Lists of all right tiles, and how many equal heads were dropped.
 
     Parameters
     ----------
     starts, ends : [tiles_y, tiles_x, rows] where each list begins and ends in ``fifo``
-    fifo : ranks; sorted in each list, but for the last row's where ``spill``
-    depths : [M] by rank, to merge by depth alone; None merges by rank
-    spill : the last row came through memory in no order and is sorted first
+    fifo : ranks, ascending in each list
+    depths : [M] by rank, to merge by depth alone; None merges by rank. One splat in two rows, with
+        another of its depth before it in one of them, is then not recognised and stays twice.
     """
     tiles_y, tiles_x, _rows = starts.shape
-    if spill:
-        run_chunks(_sort_last_row, tiles_y, starts, ends, fifo)
     order = np.zeros(0, np.int32)
     if depths is not None:  # splats of equal depth bits share the number of their depth
         order = np.cumsum(np.diff(depths, prepend=depths[:1]) > 0, dtype=np.int32)
     offsets = offsets_of((ends - starts).sum(axis=2))
-    merged = np.full(offsets[-1], -1, np.int32)
+    merged = np.empty(offsets[-1], np.int32)
     lengths = np.empty((tiles_y, tiles_x), np.int32)
     arguments = (starts, ends, fifo, order, offsets, merged, lengths)
     duplicates = sum(run_chunks(_merge, tiles_y, *arguments))
-    if duplicates:
-        merged, offsets = merged[merged >= 0], offsets_of(lengths)
+    if duplicates:  # the lists they stood in are shorter than their places
+        behind = np.repeat(offsets[:-1] + lengths.ravel(), np.diff(offsets))
+        merged, offsets = merged[np.arange(len(merged)) < behind], offsets_of(lengths)
     return TileLists(tiles_x, tiles_y, offsets, merged), duplicates

@@ -14,7 +14,7 @@ from typing import Any
 
 from gaussians.errors import InputError
 
-_CHUNKS_PER_THREAD = 8  # uneven rows (sky, ground) even out; a chunk costs some 20 us to start
+_CHUNKS_PER_THREAD = 16  # uneven rows (sky, ground) even out; a chunk costs some 20 us to start
 
 _state: dict[str, Any] = {"threads": None, "pool": None}
 
@@ -40,19 +40,20 @@ def set_threads(count: int) -> None:
 def run_chunks(kernel: Callable[..., Any], count: int, *arguments: Any) -> list[Any]:
     """Call ``kernel(begin, end, *arguments)`` over 0..count in chunks; values in chunk order.
 
-    The first chunk runs alone, so that a kernel is compiled once before threads call it.
+    The first chunk is index 0 alone and runs before the others, so that a kernel is compiled once
+    before threads call it.
     """
     workers = threads()
     if count == 0:
         return []
     chunk = max(1, -(-count // (workers * _CHUNKS_PER_THREAD)))
-    begins = range(0, count, chunk)
-    first = kernel(0, min(chunk, count), *arguments)
+    begins = range(1, count, chunk)
+    first = kernel(0, 1, *arguments)
     if workers == 1:
-        rest = [kernel(b, min(b + chunk, count), *arguments) for b in begins[1:]]
+        rest = [kernel(b, min(b + chunk, count), *arguments) for b in begins]
     else:
         futures = [
-            _state["pool"].submit(kernel, b, min(b + chunk, count), *arguments) for b in begins[1:]
+            _state["pool"].submit(kernel, b, min(b + chunk, count), *arguments) for b in begins
         ]
         rest = [f.result() for f in futures]
     return [first, *rest]

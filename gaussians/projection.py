@@ -15,7 +15,6 @@ from gaussians.constants import (
     CONIC_B,
     CONIC_C,
     DILATION_PX2,
-    FEATURES,
     OPACITY,
     OPACITY_MIN,
     THRESHOLD,
@@ -23,6 +22,7 @@ from gaussians.constants import (
     V,
 )
 from gaussians.float32_math import ln_float64
+from gaussians.lanes import prefetch
 from gaussians.parallel import run_chunks
 from gaussians.scene import Scene
 from gaussians.sorting import depth_order
@@ -30,6 +30,8 @@ from gaussians.sorting import depth_order
 Float32 = NDArray[np.float32]
 
 _ONE, _TWO = np.float32(1), np.float32(2)
+_RECORD = 16  # float32 words of a feature record: 64 bytes, so that one line holds its 10 features
+_AHEAD = 16  # splats whose scattered numbers are asked for in advance
 _INFINITY = np.float32(np.inf)
 
 
@@ -39,7 +41,8 @@ class ProjectedSplats:
 
     ids: NDArray[np.int32]  # [M] rank -> id in the scene
     depths: Float32  # [M] z in metres, the same bits in both eyes
-    features: Float32  # [eyes, M, 10] u, v, conic A B C, threshold, opacity, red, green, blue
+    # [eyes, M, 16] u, v, conic A B C, threshold, opacity, red, green, blue; the rest is zero
+    features: Float32
     covariances: Float32  # [eyes, M, 3] cxx, cxy, cyy in px^2
     behind_near: int
     transparent: int
@@ -68,7 +71,7 @@ class _Job(NamedTuple):
     quaternions: Float32
     scales: Float32
     opacities: Float32
-    features: Float32  # [eyes, M, 10], written
+    features: Float32  # [eyes, M, 16], written
     covariances: Float32  # [eyes, M, 3], written
     keep: NDArray[np.bool_]  # [M], written
 
@@ -108,6 +111,11 @@ def _project(begin: int, end: int, job: _Job) -> None:
     r = job.world_to_left
     t = np.empty((3, 3), np.float32)
     for rank in range(begin, end):
+        ahead = np.intp(job.ids[min(rank + _AHEAD, end - 1)])
+        prefetch(job.means, 3 * ahead)
+        prefetch(job.quaternions, 4 * ahead)
+        prefetch(job.scales, 3 * ahead)
+        prefetch(job.opacities, ahead)
         i = job.ids[rank]
         mx, my, mz = job.means[i, 0], job.means[i, 1], job.means[i, 2]
         x_left = ((r[0, 0] * mx + r[0, 1] * my) + r[0, 2] * mz) + r[0, 3]
@@ -175,7 +183,7 @@ def project(scene: Scene, rig: StereoRig, *, eyes: int = 2) -> ProjectedSplats:
     ids = np.flatnonzero(in_front & opaque).astype(np.int32)
     ids = depth_order(depths[ids], ids)
     count = len(ids)
-    features = np.zeros((eyes, count, FEATURES), np.float32)
+    features = np.zeros((eyes, count, _RECORD), np.float32)
     covariances = np.zeros((eyes, count, 3), np.float32)
     keep = np.zeros(count, np.bool_)
     limit_x, limit_y = rig.jacobian_limits

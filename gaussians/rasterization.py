@@ -1,9 +1,14 @@
-"""Rasterisation of one eye from its tile lists: alpha check, blending, termination, counts."""
+"""Rasterisation of one eye from its tile lists: alpha check, blending, termination, counts.
+
+A block of 4x4 pixels is one `Lanes`; its transmittance and colour stay in registers while its
+tile's list is walked. A tile of 4 px is one block; larger tiles walk their list once per block, and
+their counts come out the same, for no pixel asks what another has seen.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -24,16 +29,32 @@ from gaussians.constants import (
     V,
 )
 from gaussians.float32_math import exp_float32
+from gaussians.lanes import (
+    WIDTH,
+    broadcast,
+    count,
+    halves,
+    load,
+    minimum,
+    pair,
+    prefetch,
+    select,
+    store,
+)
 from gaussians.parallel import run_chunks
 from gaussians.tiling import TileGrid, TileLists
 from gaussians.work import EyeWork
 
 Float32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
 
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _MINUS_HALF = np.float32(-0.5)
-_COUNTERS = 5  # processed, alpha checks, passes, blends, terminated
+BLOCK = 4
+_INFINITY = np.float32(np.inf)
+_BLOCK = 4  # pixels; a block has WIDTH of them
+_AHEAD = 16  # list entries whose scattered records are asked for in advance
+_COUNTERS = 5
+_PROCESSED, _CHECKS, _PASSES, _BLENDS, _TERMINATED = range(_COUNTERS)
 
 
 @dataclass(frozen=True)
@@ -52,11 +73,9 @@ class _Job(NamedTuple):
     """What the kernel reads, and after the lists what it writes."""
 
     tile: int
-    first_column: int
-    last_column: int  # exclusive
-    origin: int  # the grid's first column
+    origin: int  # the grid's first pixel column
     tiles_x: int
-    features: Float32  # [M, 10]
+    features: Float32  # [M, 10 or more]
     offsets: NDArray[np.int64]
     splats: NDArray[np.int32]
     background: Float32  # [3]
@@ -66,38 +85,101 @@ class _Job(NamedTuple):
     live_passes: NDArray[np.uint8]
 
 
-@njit(cache=True, error_model="numpy")
-def _place(
-    row: int,
-    column: int,
-    tile: int,
-    origin: int,
-    size: tuple[int, int],
-    xs: Float32,
-    ys: Float32,
-    live: Int32,
-) -> int:
-    """Pixel centres of a tile's lanes, and which lie inside the image; returns their number."""
-    inside = 0
-    for lane in range(tile * tile):
-        x, y = column * tile + lane % tile, row * tile + lane // tile
-        xs[lane], ys[lane] = np.float32(origin * tile + x) + _HALF, np.float32(y) + _HALF
-        live[lane] = 1 if y < size[0] and x < size[1] else 0
-        inside += live[lane]
-    return inside
+@njit(inline="always")
+def _check(features: Float32, one: Any, two: Any, two_counts: bool, xs: Any, ys: Any) -> Any:
+    """Of two splats: where each passes, and its alpha there. The second may be none at all."""
+    dx = xs - pair(features[one, U], features[two, U])
+    dy = ys - pair(features[one, V], features[two, V])
+    a = pair(features[one, CONIC_A], features[two, CONIC_A])
+    b = pair(features[one, CONIC_B], features[two, CONIC_B])
+    c = pair(features[one, CONIC_C], features[two, CONIC_C])
+    p = _MINUS_HALF * ((a * dx) * dx + (c * dy) * dy) - (b * dx) * dy
+    threshold_two = features[two, THRESHOLD] if two_counts else _INFINITY
+    passes = (p <= _ZERO) & (p >= pair(features[one, THRESHOLD], threshold_two))
+    opacity = pair(features[one, OPACITY], features[two, OPACITY])
+    return passes, minimum(opacity * exp_float32(select(passes, p, _ZERO)), ALPHA_MAX)
+
+
+@njit(inline="always")
+def _blend(alpha: Any, passed: Any, t: Any, live: Any) -> Any:
+    """The splat's weight; transmittance and live pixels after it."""
+    rest = t * (_ONE - alpha)
+    stopped = passed & (rest < TRANSMITTANCE_STOP)
+    blended = passed & ~stopped
+    return select(blended, alpha * t, _ZERO), select(blended, rest, t), live & ~stopped
+
+
+@njit(inline="always")
+def _walk(
+    features: Float32,
+    splats: NDArray[np.int32],
+    live_passes: NDArray[np.uint8],
+    entries: tuple[int, int],
+    pixels: Any,
+    gathered: Float32,
+) -> tuple[int, int, int, int]:
+    """Blend a list into one block; red, green, blue and transmittance go to ``gathered`` [4, 16].
+
+    Two entries a turn, whose checks are independent. Returns the entries processed, alpha checks,
+    passes, and pixels still live.
+    """
+    entry, last = entries
+    x, y, live = pixels
+    xs, ys = pair(x, x), pair(y, y)
+    t, red, green, blue = broadcast(_ONE), broadcast(_ZERO), broadcast(_ZERO), broadcast(_ZERO)
+    processed, checks, passes, live_count = 0, 0, 0, count(live)
+    while entry < last and live_count > 0:
+        for ahead in range(entry + _AHEAD, entry + _AHEAD + 2):
+            upcoming = np.intp(splats[np.uintp(min(ahead, splats.shape[0] - 1))])
+            prefetch(features, upcoming * features.shape[1])
+        two_counts = entry + 1 < last
+        one = np.uintp(splats[np.uintp(entry)])  # unsigned: no index from the end
+        two = np.uintp(splats[np.uintp(entry + 1)]) if two_counts else one
+        passed_both, alpha_both = _check(features, one, two, two_counts, xs, ys)
+        passed_one, passed_two = halves(passed_both)
+        alpha_one, alpha_two = halves(alpha_both)
+
+        passed = passed_one & live
+        hits = count(passed)
+        processed, checks, passes = processed + 1, checks + live_count, passes + hits
+        if live_passes.shape[0] > 0 and hits > 0:
+            live_passes[entry] = 1
+        weight, t, live = _blend(alpha_one, passed, t, live)
+        red = red + weight * features[one, RED]
+        green = green + weight * features[one, GREEN]
+        blue = blue + weight * features[one, BLUE]
+
+        live_count = count(live)
+        checked = live_count if two_counts else 0
+        passed = passed_two & live
+        hits = count(passed)
+        processed, checks, passes = processed + (checked > 0), checks + checked, passes + hits
+        if live_passes.shape[0] > 0 and hits > 0:
+            live_passes[entry + 1] = 1
+        weight, t, live = _blend(alpha_two, passed, t, live)
+        red = red + weight * features[two, RED]
+        green = green + weight * features[two, GREEN]
+        blue = blue + weight * features[two, BLUE]
+        live_count = count(live)
+        entry += 2
+    store(gathered, 0, red)
+    store(gathered, WIDTH, green)
+    store(gathered, 2 * WIDTH, blue)
+    store(gathered, 3 * WIDTH, t)
+    return processed, checks, passes, live_count
 
 
 @njit(cache=True, error_model="numpy")
-def _write(job: _Job, row: int, column: int, colour: Float32, t: Float32) -> None:
-    """What the lanes of a tile have gathered, in front of the background."""
+def _write(job: _Job, x0: int, y0: int, gathered: Float32) -> None:
+    """What the pixels of a block have gathered, in front of the background."""
     height, width = job.transmittance.shape
-    for lane in range(job.tile * job.tile):
-        x, y = column * job.tile + lane % job.tile, row * job.tile + lane // job.tile
-        if y < height and x < width:
+    for y in range(y0, min(y0 + _BLOCK, height)):
+        for x in range(x0, min(x0 + _BLOCK, width)):
+            lane = (y - y0) * _BLOCK + (x - x0)
+            rest = gathered[3, lane]
             for channel in range(3):
-                behind = t[lane] * job.background[channel]
-                job.image[y, x, channel] = colour[channel, lane] + behind
-            job.transmittance[y, x] = t[lane]
+                job.image[y, x, channel] = gathered[channel, lane] + rest * job.background[channel]
+            job.transmittance[y, x] = rest
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -105,65 +187,31 @@ def _raster_rows(begin: int, end: int, job: _Job) -> None:
     tile, tiles_x = job.tile, job.tiles_x
     features, offsets, splats = job.features, job.offsets, job.splats
     work, live_passes = job.work, job.live_passes
-    size = job.transmittance.shape
-    pixels = tile * tile
-    xs, ys = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
-    power, weight = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
-    t, colour = np.empty(pixels, np.float32), np.empty((3, pixels), np.float32)
-    red, green, blue = colour[0], colour[1], colour[2]
-    live, passed = np.empty(pixels, np.int32), np.empty(pixels, np.int32)
-    record_passes = live_passes.shape[0] > 0
+    height, width = job.transmittance.shape
+    gathered, centres = np.empty((4, WIDTH), np.float32), np.empty((2, WIDTH), np.float32)
+    for lane in range(WIDTH):
+        centres[0, lane] = np.float32(lane % _BLOCK) + _HALF
+        centres[1, lane] = np.float32(lane // _BLOCK) + _HALF
     for row in range(begin, end):
-        for column in range(job.first_column, job.last_column):
-            live_count = _place(row, column, tile, job.origin, size, xs, ys, live)
-            t[:], colour[:] = _ONE, _ZERO
-            processed, checks, passes, blends = 0, 0, 0, 0
-            index = row * tiles_x + column
-            for entry in range(offsets[index], offsets[index + 1]):
-                if live_count == 0:
-                    break
-                record = features[splats[entry]]
-                u, v = record[U], record[V]
-                a, b, c = record[CONIC_A], record[CONIC_B], record[CONIC_C]
-                threshold, opacity = record[THRESHOLD], record[OPACITY]
-                processed += 1
-                checks += live_count
-                hits = 0
-                for lane in range(pixels):
-                    dx, dy = xs[lane] - u, ys[lane] - v
-                    p = _MINUS_HALF * ((a * dx) * dx + (c * dy) * dy) - (b * dx) * dy
-                    hit = np.int32(p <= _ZERO) & np.int32(p >= threshold) & live[lane]
-                    passed[lane] = hit
-                    power[lane] = p if hit != 0 else _ZERO
-                    hits += hit
-                if hits == 0:
-                    continue
-                passes += hits
-                if record_passes:
-                    live_passes[entry] = 1
-                r, g, bl = record[RED], record[GREEN], record[BLUE]
-                stopped = 0
-                for lane in range(pixels):
-                    alpha = min(ALPHA_MAX, opacity * exp_float32(power[lane]))
-                    rest = t[lane] * (_ONE - alpha)
-                    stop = passed[lane] & np.int32(rest < TRANSMITTANCE_STOP)
-                    blend = passed[lane] & (stop ^ 1)
-                    weight[lane] = alpha * t[lane] if blend != 0 else _ZERO
-                    t[lane] = rest if blend != 0 else t[lane]
-                    live[lane] = live[lane] & (stop ^ 1)
-                    stopped += stop
-                for lane in range(pixels):
-                    red[lane] = red[lane] + r * weight[lane]
-                    green[lane] = green[lane] + g * weight[lane]
-                    blue[lane] = blue[lane] + bl * weight[lane]
-                live_count -= stopped
-                blends += hits - stopped
-            _write(job, row, column, colour, t)
-            work[0, row, column] = processed
-            work[1, row, column] = checks
-            work[2, row, column] = passes
-            work[3, row, column] = blends
-            work[4, row, column] = 1 if live_count == 0 else 0
+        for column in range(tiles_x):
+            entries = offsets[row * tiles_x + column], offsets[row * tiles_x + column + 1]
+            alive = 0
+            for y0 in range(row * tile, (row + 1) * tile, _BLOCK):
+                for x0 in range(column * tile, (column + 1) * tile, _BLOCK):
+                    x = load(centres, 0) + np.float32(x0)
+                    y = load(centres, WIDTH) + np.float32(y0)
+                    live = (x < np.float32(width)) & (y < np.float32(height))
+                    x = x + np.float32(job.origin)
+                    processed, checks, passes, live_count = _walk(
+                        features, splats, live_passes, entries, (x, y, live), gathered
+                    )
+                    _write(job, x0, y0, gathered)
+                    alive += live_count
+                    work[_PROCESSED, row, column] = max(work[_PROCESSED, row, column], processed)
+                    work[_CHECKS, row, column] += checks
+                    work[_PASSES, row, column] += passes
+                    work[_BLENDS, row, column] += passes - (count(live) - live_count)
+            work[_TERMINATED, row, column] = 1 if alive == 0 else 0
 
 
 def rasterise(
@@ -172,34 +220,24 @@ def rasterise(
     grid: TileGrid,
     background: tuple[float, float, float],
     *,
-    columns: tuple[int, int] | None = None,
-    onto: EyeImage | None = None,
     record_passes: bool = False,
 ) -> EyeImage:
-    """Render the tiles of one eye.
+    """Render one eye.
 
     Parameters
     ----------
-    features : [M, 10] float32 feature records by rank
+    features : [M, 10 or more] float32 feature records by rank
     lists : tile lists of the same grid
     background : colour behind everything
-    columns : half-open range of tile columns to render; all by default
-    onto : earlier image of the other columns; its arrays are written to and its work is added
     record_passes : also report, per list entry, whether it passed in a pixel still live
     """
     counters = np.zeros((_COUNTERS, grid.tiles_y, grid.tiles_x), np.int32)
-    if onto is None:
-        image = np.zeros((grid.height, grid.width, 3), np.float32)
-        transmittance = np.ones((grid.height, grid.width), np.float32)
-    else:
-        image, transmittance = onto.image, onto.transmittance
+    image = np.empty((grid.height, grid.width, 3), np.float32)
+    transmittance = np.empty((grid.height, grid.width), np.float32)
     live_passes = np.zeros(len(lists.splats) if record_passes else 0, np.uint8)
-    first, last = columns or (0, grid.tiles_x)
     job = _Job(
         grid.tile_px,
-        first,
-        last,
-        grid.first_column,
+        grid.first_column * grid.tile_px,
         grid.tiles_x,
         features,
         lists.offsets,
@@ -211,18 +249,4 @@ def rasterise(
         live_passes,
     )
     run_chunks(_raster_rows, grid.tiles_y, job)
-    entries = np.zeros_like(counters[0])
-    entries[:, first:last] = lists.lengths[:, first:last]
-    new = [entries, *counters]
-    if onto is not None:
-        old = onto.work
-        earlier = (
-            old.entries,
-            old.processed,
-            old.alpha_checks,
-            old.passes,
-            old.blends,
-            old.terminated,
-        )
-        new = [a + b for a, b in zip(earlier, new, strict=True)]
-    return EyeImage(image, transmittance, EyeWork(*new), live_passes)
+    return EyeImage(image, transmittance, EyeWork(lists.lengths, *counters), live_passes)

@@ -199,14 +199,10 @@ def _colour(
     scene: Scene, rig: StereoRig, splats: ProjectedSplats, rows: RowSpans
 ) -> NDArray[np.bool_]:
     """[eyes, M] which splats stand in a tile; fills the colours of those that stand in any."""
-    visible = np.zeros((splats.eyes, len(splats.ids)), np.bool_)
-    for eye, spans in zip(visible, rows.spans, strict=True):
-        eye[rows.ranks[spans[:, 0] <= spans[:, 1]]] = True
-    needed = np.any(visible, axis=0)
-    positions = (rig.left_position, rig.right_position)
-    for features, position in zip(splats.features, positions, strict=False):
-        fill_colours(features, splats.ids, needed, scene.means, scene.sh, position)
-    return visible
+    needed = np.any(rows.visible, axis=0)
+    positions = np.stack([rig.left_position, rig.right_position])[: splats.eyes]
+    fill_colours(splats.features, splats.ids, needed, scene.means, scene.sh, positions)
+    return rows.visible
 
 
 def _patched(right: EyeImage, own: EyeImage, tiles: NDArray[np.bool_], grid: TileGrid) -> EyeImage:

@@ -53,6 +53,7 @@ def keeping(method: StereoMethod, causes: Collection[str], name: str) -> StereoM
         insertion = "two_tiles" if method.by_disparity else method.insertion
     if "insertion" in causes and method.insertion in ("floor", "round"):
         insertion = method.insertion
+    loose = "footprint" in causes  # a box that holds the ellipse is not
     carried = insertion == "carrier"
     ranged = "rows" in causes and method.out_of_range == "drop"
     hidden = "left_view" in causes and method.left_view == "image"
@@ -61,7 +62,7 @@ def keeping(method: StereoMethod, causes: Collection[str], name: str) -> StereoM
         name=name,
         forwarding=passes if checked else entries,
         insertion=insertion,
-        intersection=method.intersection if "footprint" in causes else "ellipse",
+        intersection=method.intersection if loose or method.intersection == "box" else "ellipse",
         rows=method.rows,
         out_of_range="drop" if ranged else "forward_only" if carried else "spill",
         conic=method.conic if "conic" in causes else "per_eye",
@@ -76,7 +77,7 @@ def keeping(method: StereoMethod, causes: Collection[str], name: str) -> StereoM
 def causes_of(method: StereoMethod) -> tuple[str, ...]:
     """Names of the causes present in ``method``; none for `independent` and `exact`."""
     if method.forwarding == "none":
-        return () if method.intersection == "ellipse" else ("footprint",)
+        return () if method.intersection in ("ellipse", "box") else ("footprint",)
     exact = keeping(method, (), "")
     return tuple(cause for cause in CAUSE_NAMES if keeping(method, (cause,), "") != exact)
 

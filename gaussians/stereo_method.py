@@ -32,9 +32,9 @@ class StereoMethod:
         eye bins for itself. ``live_alpha_pass``: what passes in a pixel that has not stopped.
         ``alpha_pass``: what passes in any pixel, also after the tile has terminated.
         ``live_list``: every entry until the tile terminates. ``list``: every entry.
-    insertion : into which right tiles. By disparity d in tiles: ``floor`` and ``round`` into one,
-        ``two_tiles`` into both that the shifted tile touches. By the right eye's own footprint:
-        ``right_span``, each tile of it from the left list entry nearest to t + ceil(d);
+    insertion : into which right tiles. By disparity d in tiles: ``floor`` and ``round`` (half up)
+        into one, ``two_tiles`` into both that the shifted tile touches. By the right eye's own
+        footprint: ``right_span``, each tile of it from the left list entry nearest to t + ceil(d);
         ``carrier`` the same, and where no left list holds the splat, binning adds a forward-only
         entry.
     intersection : footprint both eyes are binned by, see footprints.py

@@ -115,15 +115,29 @@ def _by_footprint(
             rank = ranks[entry]
             left_begin, left_end = spans[entry, 0] + left_first, spans[entry, 1] + left_first
             for column in range(right[entry, 0], right[entry, 1] + 1):
+                if independent[column]:
+                    continue
                 target = column + shift
                 carrier = target + moved[rank]
-                if left_begin <= left_end:
+                held = left_begin <= left_end
+                if held:
                     carrier = min(max(carrier, left_begin), left_end)
-                if carrier < first or carrier > last:
-                    if lose_beyond:
+                if not (held or carried) or (lose_beyond and not first <= carrier <= last):
+                    unseen += 1
+                    continue
+                carrier = min(max(carrier, first), last)
+                if policy == _FORWARD_ONLY:
+                    carrier = min(max(carrier, target), target + rows - 1)
+                    if not first <= carrier <= last:
                         unseen += 1
                         continue
-                    carrier = min(max(carrier, first), last)
+                tile = carrier - left_first
+                added = carrier < left_begin or carrier > left_end
+                if added:
+                    if 0 <= tile < last_rank.shape[0] and rank > last_rank[tile]:
+                        continue
+                elif filtered and forwards[list_offsets[tile] + seen[tile]] == 0:
+                    continue
                 k = carrier - target
                 if k < 0 or k >= rows:
                     if policy == _DROP:
@@ -132,31 +146,13 @@ def _by_footprint(
                     if policy == _INDEPENDENT:
                         independent[column] = True
                         continue
-                    if policy == _SPILL:
-                        k = rows
-                    else:
-                        carrier = min(max(carrier, target), target + rows - 1)
-                        k = carrier - target
-                if left_begin <= carrier <= left_end:
-                    if filtered:
-                        tile = carrier - left_first
-                        if forwards[list_offsets[tile] + seen[tile]] == 0:
-                            continue
-                elif not carried:
-                    unseen += 1
-                    continue
-                else:
-                    tile = carrier - left_first
-                    if 0 <= tile < last_rank.shape[0] and rank > last_rank[tile]:
-                        continue
-                    if not fill:
-                        forward_only[row, carrier - lowest] += 1
-                if k == rows:
+                    k = rows
                     spilled += 1
                 if fill:
-                    if not independent[column]:
-                        entries[cursors[column, k]] = rank
-                        cursors[column, k] += 1
+                    if added:
+                        forward_only[row, carrier - lowest] += 1
+                    entries[cursors[column, k]] = rank
+                    cursors[column, k] += 1
                 else:
                     counts[column, k] += 1
             if filtered:
@@ -197,7 +193,7 @@ def _by_disparity(
                 for step in range(1 + extra[rank]):
                     k = moved[rank] + step
                     column = tile + right_first - k
-                    if column < 0 or column >= tiles_x:
+                    if column < 0 or column >= tiles_x or independent[column]:
                         continue
                     if k >= rows:
                         if policy == _DROP:
@@ -209,17 +205,18 @@ def _by_disparity(
                         k = rows
                         spilled += 1
                     if fill:
-                        if not independent[column]:
-                            entries[cursors[column, k]] = rank
-                            cursors[column, k] += 1
+                        entries[cursors[column, k]] = rank
+                        cursors[column, k] += 1
                     else:
                         counts[column, k] += 1
         losses[row, 0], losses[row, 1] = dropped, spilled
 
 
 def right_features(splats: ProjectedSplats, rig: StereoRig, method: StereoMethod) -> Float32:
-    """[M, 10] the right eye's feature records under the method's reuse switches."""
+    """[M, 16] the right eye's feature records under the method's reuse switches."""
     left, right = splats.features
+    if (method.conic, method.colour, method.centre) == ("per_eye", "per_eye", "projected"):
+        return right
     out = right.copy()
     if method.conic == "left":
         out[:, CONIC_A : CONIC_C + 1] = left[:, CONIC_A : CONIC_C + 1]
@@ -288,7 +285,7 @@ def forward(
     filling = counting._replace(fill=True, cursors=starts.copy(), entries=entries)
     run_chunks(kernel, grid.tiles_y, filling, *arguments)
     depths = splats.depths if method.tie == "depth" else None
-    lists, duplicates = merge_rows(starts, ends, entries, depths, method.out_of_range == "spill")
+    lists, duplicates = merge_rows(starts, ends, entries, depths)
     dropped, spilled, unseen = (int(loss) for loss in losses.sum(axis=0))
     by_row = np.ascontiguousarray(np.moveaxis(counts, 2, 0))
     return StereoForwarding(

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from gaussians.constants import U, V
+from gaussians.constants import CONIC_A, CONIC_B, CONIC_C, THRESHOLD, U, V
 from gaussians.errors import InputError
 from gaussians.footprints import (
     ELLIPSE,
@@ -81,6 +81,7 @@ class RowSpans:
     ranks: NDArray[np.int32]  # [entries]
     spans: NDArray[np.int16]  # [eyes, entries, 2] first and last tile column; empty: first > last
     counts: NDArray[np.int32]  # [eyes, tiles_y, tiles_x] list lengths
+    visible: NDArray[np.bool_]  # [eyes, M] splats that stand in a tile
     ill_conditioned: int  # splats whose region is unbounded by rounding
 
 
@@ -122,6 +123,22 @@ def _column_span(job: _Job, u: float, v: float, shape: Shape, row: int) -> tuple
     return first >> job.shift, last >> job.shift
 
 
+@njit(inline="always")
+def _wide(features: Float32, covariances: Float32, eye: int, rank: int) -> tuple[Any, Any, Any]:
+    """Conic, threshold and covariance of a splat in float64."""
+    conic = (
+        np.float64(features[eye, rank, CONIC_A]),
+        np.float64(features[eye, rank, CONIC_B]),
+        np.float64(features[eye, rank, CONIC_C]),
+    )
+    covariance = (
+        np.float64(covariances[eye, rank, 0]),
+        np.float64(covariances[eye, rank, 1]),
+        np.float64(covariances[eye, rank, 2]),
+    )
+    return conic, np.float64(features[eye, rank, THRESHOLD]), covariance
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
 def _row_ranges(
     begin: int,
@@ -138,7 +155,8 @@ def _row_ranges(
         for rank in range(block * _BLOCK, min((block + 1) * _BLOCK, rows.shape[0])):
             half = -1.0
             for eye in range(features.shape[0]):
-                extent, _shape = footprint(job.rule, features[eye, rank], covariances[eye, rank])
+                conic, threshold, covariance = _wide(features, covariances, eye, rank)
+                extent, _shape = footprint(job.rule, conic, threshold, covariance)
                 half = max(half, extent)
             if half == np.inf:
                 unbounded += 1
@@ -170,18 +188,22 @@ def _row_entries(
     cursors: NDArray[np.int64],
     ranks: NDArray[np.int32],
     spans: NDArray[np.int16],
+    visible: NDArray[np.bool_],
 ) -> None:
     """Splat by splat, so that a splat's numbers are read once for all its rows and both eyes."""
     for block in range(begin, end):
         for rank in range(block * _BLOCK, min((block + 1) * _BLOCK, rows.shape[0])):
             for eye in range(features.shape[0]):
-                feature = features[eye, rank]
-                u, v = np.float64(feature[U]), np.float64(feature[V])
-                _half, shape = footprint(job.rule, feature, covariances[eye, rank])
+                u, v = np.float64(features[eye, rank, U]), np.float64(features[eye, rank, V])
+                conic, threshold, covariance = _wide(features, covariances, eye, rank)
+                _half, shape = footprint(job.rule, conic, threshold, covariance)
+                seen = False
                 for row in range(rows[rank, 0], rows[rank, 1] + 1):
                     entry = cursors[block, row]
                     first, last = _column_span(job, u, v, shape, row)
                     spans[eye, entry, 0], spans[eye, entry, 1] = first, last
+                    seen |= first <= last
+                visible[eye, rank] = seen
             for row in range(rows[rank, 0], rows[rank, 1] + 1):
                 ranks[cursors[block, row]] = rank
                 cursors[block, row] += 1
@@ -256,10 +278,11 @@ def row_spans(
     cursors = offsets[:-1] + np.cumsum(block_counts, axis=0) - block_counts
     ranks = np.empty(offsets[-1], np.int32)
     spans = np.empty((splats.eyes, len(ranks), 2), np.int16)
-    run_chunks(_row_entries, blocks, job, *arrays, rows, cursors, ranks, spans)
+    visible = np.empty((splats.eyes, len(rows)), np.bool_)
+    run_chunks(_row_entries, blocks, job, *arrays, rows, cursors, ranks, spans, visible)
     counts = np.empty((splats.eyes, grid.tiles_y, grid.tiles_x), np.int32)
     run_chunks(_count_tiles, grid.tiles_y, offsets, spans, counts)
-    return RowSpans(grid, offsets, ranks, spans, counts, sum(unbounded))
+    return RowSpans(grid, offsets, ranks, spans, counts, visible, sum(unbounded))
 
 
 def offsets_of(counts: NDArray[np.integer]) -> NDArray[np.int64]:

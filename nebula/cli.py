@@ -215,7 +215,8 @@ def render(json_target: str | None, **values: Any) -> None:
 @threads_option
 @out_option("out/verify")
 @json_option
-def verify(json_target: str | None, **values: Any) -> None:
+@click.pass_context
+def verify(context: click.Context, json_target: str | None, **values: Any) -> None:
     """Check stereo methods against an independent right eye, and say why pixels are wrong."""
     from nebula.options import VerifyOptions
 
@@ -224,9 +225,11 @@ def verify(json_target: str | None, **values: Any) -> None:
         raise InputError("--ladder, --isolate, --hostile and --method exclude each other")
     values["mode"] = modes[0] if modes else None
     if modes == ["hostile"]:
-        idle = [key for key in (*_SCENE_KEYS, "config", "frames") if values.get(key) is not None]
-        if idle:
-            raise InputError(f"--hostile brings its own scenes; {', '.join(idle)}: not of use")
+        ours = {"hostile", "tile_px", "threads", "out", "json_target"}
+        given = [p for p in context.command.params if _is_given(context, p) and p.name not in ours]
+        if given:
+            names = ", ".join(p.opts[0] for p in given)
+            raise InputError(f"--hostile brings its own scenes and rigs; {names}: not of use")
     values["moving"] = values["trace"] is not None or (values["frames"] or 1) > 1
     values["frames"] = values["frames"] or (12 if values["moving"] else 1)
     values["tile_px"] = int(values["tile_px"])
@@ -368,6 +371,11 @@ _SCENE_KEYS = (
     *("scene", "city_leaves", "level", "up", "units_per_metre", "near_m", "trace"),
     *_VIEW_KEYS,
 )
+
+
+def _is_given(context: click.Context, parameter: click.Parameter) -> bool:
+    source = context.get_parameter_source(parameter.name or "")
+    return source not in (None, click.core.ParameterSource.DEFAULT)
 
 
 def _execute(

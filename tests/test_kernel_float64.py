@@ -8,15 +8,23 @@ types are read.
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
+from gaussians.number_formats import FORMATS, rasterise_in_format
+from gaussians.projection import project
+from gaussians.render import render_stereo
+from gaussians.stereo_method import PRESETS
 from gaussians.synthetic import generate_city
-from lod_cloud import build_tree, prove_nesting
+from gaussians.tiling import TileGrid, row_spans, tile_lists
+from lod_cloud import SearchRequest, build_tree, prove_nesting
+from lod_cloud.search import SEARCHES, OctreeGsSearch, SearchTree, make_search
 from nebula import simulate
 from nebula.options import SimulateOptions, scene_options
 from tests.kernel_types import float64_variables, is_inlined, project_kernels
+from tests.strategies import build_case, small_rig
 
 pytestmark = pytest.mark.skipif(
     os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="needs numba's compiler"
@@ -33,6 +41,12 @@ FLOAT64 = {
     "gaussians.synthetic": "scenes are generated in float64 and rounded once",
     "lod_cloud.criterion._count_violations": "places the proof's cameras, then rounds them",
     "lod_cloud.merge": "parents are merged in float64 and rounded once (sizes up)",
+    "lod_cloud.search.sectors": "bounds on the camera's way; no decision is taken with them",
+    "lod_cloud.search.treelets._margin": "how long a decision holds, by a stated bound",
+    "lod_cloud.search.treelets.search_treelets": "keeps those margins; decisions are float32",
+    "lod_cloud.search.wheel_kernels._bucket": "how long a decision holds, by a stated bound",
+    "lod_cloud.search.wheel_kernels.collect": "moves the hands, rounded up",
+    "lod_cloud.search.wheel_kernels.insert": "how long a decision holds, by a stated bound",
 }
 # Of these, where float32 matters beside float64: the float64 variables by name.
 NAMES = {
@@ -49,7 +63,7 @@ def declared(name: str) -> bool:
 
 @pytest.fixture(scope="module")
 def kernels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Every kernel of the project, after a run of the main job and of the nesting proof."""
+    """Every kernel of the project, after a run of the main job and of what it leaves out."""
     scene = scene_options(None, {"city_leaves": 1500, "width": 48, "height": 48})
     for method in ("exact", "paper", "independent"):
         options = SimulateOptions(
@@ -69,7 +83,31 @@ def kernels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         )
         simulate.run(options)
     prove_nesting(build_tree(generate_city(1500, 0).scene))
+    _render_otherwise()
+    _search_otherwise()
     return project_kernels()
+
+
+def _render_otherwise() -> None:
+    """What `simulate` does not do: other number formats, a stereo buffer that spills."""
+    case = build_case([("ordinary", 0)], small_rig())
+    render_stereo(case.scene, case.rig, replace(PRESETS["paper"], out_of_range="spill"))
+    grid = TileGrid(case.rig.display.width, case.rig.display.height, 4)
+    splats = project(case.scene, case.rig)
+    lists = tile_lists(row_spans(splats, grid), 0)
+    for number_format in FORMATS.values():
+        rasterise_in_format(number_format, splats.features[0], lists, grid)
+
+
+def _search_otherwise() -> None:
+    """Every search, first and incremental, with a change of settings."""
+    tree = SearchTree.of(build_tree(generate_city(1500, 0).scene))
+    for name in SEARCHES:
+        search = make_search(name, tree, hysteresis=0.01)
+        for step in range(60):
+            result = search.search(SearchRequest((0.05 * step, 0, 2), 900.0, 3.0 + (step == 30)))
+            assert len(result.cut) == result.cut_size and len(result.added) >= 0
+    OctreeGsSearch(tree).select(SearchRequest((0, 0, 2), 900.0, 6.0))
 
 
 @pytest.fixture(scope="module")

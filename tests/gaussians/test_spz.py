@@ -108,10 +108,10 @@ def test_spz_equals_a_value_by_value_decoder(tmp_path, version, degree):
 
 
 def colours(scene: Scene, eye: np.ndarray) -> np.ndarray:
-    features = np.zeros((len(scene), 10), np.float32)
+    features = np.zeros((1, len(scene), 10), np.float32)
     ids, needed = np.arange(len(scene), dtype=np.int32), np.ones(len(scene), bool)
-    fill_colours(features, ids, needed, scene.means, scene.sh, eye)
-    return features[:, 7:]
+    fill_colours(features, ids, needed, scene.means, scene.sh, eye[None])
+    return features[0, :, 7:]
 
 
 def test_the_half_turn_keeps_every_colour_and_covariance(tmp_path):

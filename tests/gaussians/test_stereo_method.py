@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gaussians.errors import InputError
+from gaussians.footprints import INTERSECTIONS
 from gaussians.stereo_causes import isolated, ladder
 from gaussians.stereo_method import PRESETS, StereoMethod, parse_method
 
@@ -19,7 +20,7 @@ EXACT, PAPER, INDEPENDENT = (PRESETS[name] for name in ("exact", "paper", "indep
 VALUES: dict[str, tuple[Any, ...]] = {
     "forwarding": ("none", "live_alpha_pass", "alpha_pass", "live_list", "list"),
     "insertion": ("floor", "round", "two_tiles", "right_span", "carrier"),
-    "intersection": ("ellipse", "square_3sigma", "obb"),
+    "intersection": INTERSECTIONS,
     "rows": (1, 2, 4, 1024),
     "out_of_range": ("drop", "spill", "independent_tile", "forward_only"),
     "conic": ("per_eye", "left"),
@@ -44,6 +45,11 @@ def any_method(draw: st.DrawFn) -> StereoMethod:
     return StereoMethod("drawn", **values)
 
 
+def changed(method: StereoMethod, **switches: Any) -> StereoMethod:
+    """With values that may be none of the switch's."""
+    return replace(method, **switches)
+
+
 def refused(text: str) -> Any:
     return pytest.raises(InputError, match=re.escape(text))
 
@@ -53,7 +59,7 @@ def refused(text: str) -> Any:
 def test_a_value_no_switch_has_is_refused(switch: str, value: Any) -> None:
     allowed = ", ".join(VALUES[switch])
     with refused(f"stereo method: {switch} must be one of {allowed}, not {value!r}"):
-        replace(EXACT, **{switch: value})
+        changed(EXACT, **{switch: value})
 
 
 @pytest.mark.parametrize(
@@ -68,17 +74,17 @@ def test_a_value_no_switch_has_is_refused(switch: str, value: Any) -> None:
 )
 def test_a_count_out_of_its_range_is_refused(switch: str, value: int, message: str) -> None:
     with refused(f"stereo method: {message}"):
-        replace(EXACT, **{switch: value})
+        changed(EXACT, **{switch: value})
 
 
 @pytest.mark.parametrize("insertion", VALUES["insertion"][:-1])
 @pytest.mark.parametrize("switch", ["out_of_range", "left_view"])
 def test_entries_added_by_binning_need_the_carrier_rule(insertion: str, switch: str) -> None:
-    valid = replace(EXACT, insertion=insertion, out_of_range="drop", left_view="image")
+    valid = changed(EXACT, insertion=insertion, out_of_range="drop", left_view="image")
     message = f"stereo method: {switch} forward_only needs insertion carrier, not {insertion}"
     with refused(message):
-        replace(valid, **{switch: "forward_only"})
-    assert replace(valid, insertion="carrier", **{switch: "forward_only"})
+        changed(valid, **{switch: "forward_only"})
+    assert changed(valid, insertion="carrier", **{switch: "forward_only"})
 
 
 @given(any_method(), any_method())
@@ -98,7 +104,7 @@ def test_one_switch_is_enough_to_tell_methods_apart(
     one: StereoMethod, switch: str, data: st.DataObject
 ) -> None:
     try:
-        two = replace(one, **{switch: data.draw(st.sampled_from(VALUES[switch]))})
+        two = changed(one, **{switch: data.draw(st.sampled_from(VALUES[switch]))})
     except InputError:
         return
     idle = one.forwarding == two.forwarding == "none" and switch != "intersection"

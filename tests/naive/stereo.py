@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -211,7 +212,7 @@ class Machine:
     def forwards(self, splat: int, y: int, column: int) -> bool:
         """Whether the splat's entry of this left list goes to the right eye."""
         left, x = self.left, column - self.left.first_column
-        entries = {
+        entries: dict[str, Any] = {
             "live_alpha_pass": left.live_passing,
             "alpha_pass": left.passing,
             "live_list": left.walked,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Protocol
 
 import numpy as np
@@ -85,3 +86,50 @@ def recount(lists: Lists, passing: Bool, alphas: Float32, tile_px: int) -> EyeWo
             live &= ~stopping
         counts["terminated"][row, column] = not live.any()
     return EyeWork(**counts)
+
+
+def live_passes(lists: Lists, passing: Bool, alphas: Float32, tile_px: int) -> list[int]:
+    """1 for every list entry, tile by tile, that passes in a pixel not yet stopped."""
+    found = []
+    for row, column in np.ndindex(len(lists), len(lists[0])):
+        y, x = row * tile_px, column * tile_px
+        window = slice(None), slice(y, y + tile_px), slice(x, x + tile_px)
+        transmittance = np.ones(passing[window].shape[1:], np.float32)
+        live = np.ones(transmittance.shape, bool)
+        for rank in lists[row][column]:
+            passed = live & passing[window][rank]
+            found.append(int(passed.any()))
+            after = transmittance * (1 - alphas[window][rank])
+            live &= ~(passed & (after < 1e-4))
+            transmittance = np.where(passed & live, after, transmittance)
+    return found
+
+
+def box_lists(splats: ReferenceSplats, shape: tuple[int, int], tile_px: int, grow: float) -> Lists:
+    """Of every tile, the splats whose axis-aligned box, grown by so many px, overlaps its area
+    inside the image.
+
+    The box holds the contour p = threshold: sqrt(2 q cxx) by sqrt(2 q cyy) to either side of the
+    centre, with q = -threshold and the covariance that belongs to the conic.
+    """
+    height, width = shape
+    boxes = []
+    for rank in range(len(splats.ids)):
+        a, b, c = (float(value[rank]) for value in (splats.a, splats.b, splats.c))
+        q, det = -float(splats.thresholds[rank]), a * c - b * b
+        half_width, half_height = math.sqrt(2 * q * c / det), math.sqrt(2 * q * a / det)
+        boxes.append((half_width + grow, half_height + grow))
+
+    def overlaps(rank: int, x: int, y: int) -> bool:
+        across, down = float(splats.u[rank]), float(splats.v[rank])
+        half_width, half_height = boxes[rank]
+        beside = min(x + tile_px, width) > across - half_width and x < across + half_width
+        return beside and min(y + tile_px, height) > down - half_height and y < down + half_height
+
+    return [
+        [
+            [rank for rank in range(len(boxes)) if overlaps(rank, x, y)]
+            for x in range(0, width, tile_px)
+        ]
+        for y in range(0, height, tile_px)
+    ]

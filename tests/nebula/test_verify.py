@@ -19,7 +19,7 @@ from PIL import Image
 from gaussians.cameras import Display, StereoRig
 from gaussians.poses import GENERATED_RATE_HZ
 from gaussians.quality import differing, mismatching_pixels
-from gaussians.render import render_stereo
+from gaussians.render import StereoRenderer, render_stereo
 from gaussians.stereo_causes import CAUSE_NAMES, LADDER
 from gaussians.stereo_method import PRESETS
 from gaussians.synthetic import HOSTILE, generate_city
@@ -34,10 +34,10 @@ KEYS = {
     *("entries_after_termination", "row_writes_per_entry", "processed_left", "processed_right"),
     *("alpha_checks", "duplicates", "causes", "covered_pixels_share"),
 }
-# Not the off-axis ones: the method with left_view as its only cause writes outside its arrays there
 SCENES = (
     *("near_objects", "thin_between_columns", "wall_hides_the_right_view", "depth_ties"),
     *("smaller_than_a_tile", "baseline_zero", "view_dependent_colour", "tilted_close"),
+    *("off_axis", "off_axis_inwards"),
 )
 BASELINES = [f"independent,intersection={kind}" for kind in ("square_3sigma", "obb", "ellipse")]
 Result = tuple[dict[str, Any], Path]
@@ -246,6 +246,10 @@ def test_hostile_scenes_are_judged_one_by_one(hostile: Result) -> None:
         assert row["breaks"] == HOSTILE[row["scene"]]().breaks
     for row in data["rows"][1::2]:
         assert_exact(row)
+    near = HOSTILE["near_objects"]()
+    alone = StereoRenderer(near.scene, near.rig, near.background).independent_right()
+    share = data["rows"][0]["covered_pixels_share"]
+    assert 0.1 < share < 0.99 and share == (alone.transmittance < 1).mean()
     wrong = {row["scene"] for row in data["rows"][::2] if row["mismatching_pixels"]}
     assert wrong == set(SCENES) - {"smaller_than_a_tile", "baseline_zero"}
     assert {path.name for path in out.iterdir()} == {"verify.json", "verify.csv", "verify.md"}
