@@ -8,7 +8,7 @@ return integers and are the definition that other levels call or are compared wi
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numba import njit
@@ -48,6 +48,9 @@ _LOG2_255 = math.log2(255.0)
 _ONE = np.int64(1)
 
 
+Integer: TypeAlias = int | np.int64
+
+
 class Widths(NamedTuple):
     """What the kernel needs of a format, and the constants that follow from it."""
 
@@ -55,7 +58,7 @@ class Widths(NamedTuple):
     power: int
     power_max: int  # where a power saturates
     log2_255: int
-    index: int
+    index_bits: int
     alpha: int
     alpha_max: int
     one: int  # transmittance before the first splat
@@ -77,7 +80,7 @@ def widths(number_format: FixedFormat) -> Widths:
         power=f.power_fraction,
         power_max=(1 << (POWER_INTEGER_BITS + f.power_fraction)) - 1,
         log2_255=math.floor(_LOG2_255 * 2.0**f.power_fraction + 0.5),
-        index=f.exp_index,
+        index_bits=f.exp_index,
         alpha=f.alpha_fraction,
         alpha_max=math.floor(float(ALPHA_MAX) * 2.0**f.alpha_fraction + 0.5),
         one=(1 << f.transmittance_fraction) - 1,
@@ -93,39 +96,39 @@ def widths(number_format: FixedFormat) -> Widths:
 
 
 @njit(inline="always")
-def rounded(value: int, shift: int) -> int:
+def rounded(value: Integer, shift: Integer) -> Integer:
     """``value`` / 2^shift, half up."""
     return (value + ((_ONE << shift) >> 1)) >> shift
 
 
 @njit(inline="always")
-def quadratic_form(a: int, b: int, c: int, dx: int, dy: int) -> int:
+def quadratic_form(a: Integer, b: Integer, c: Integer, dx: Integer, dy: Integer) -> Integer:
     """a dx^2 + 2 b dx dy + c dy^2, exact: any order of evaluation gives these bits."""
     return (a * dx + 2 * b * dy) * dx + c * dy * dy
 
 
 @njit(inline="always")
-def power_of(form: int, exponent: int, scale: int, w: Widths) -> int:
+def power_of(form: Integer, exponent: Integer, scale: Integer, w: Widths) -> Integer:
     """-log2 of the falloff, U5.power saturating; negative where rounding made the form so."""
     shift = exponent + 2 * (w.centre - scale) - w.power  # at least 1, see encode
     return min(((form >> (shift - 1)) + 1) >> 1, w.power_max)  # as rounded(), without its sum
 
 
 @njit(inline="always")
-def alpha_of(power: int, reach: int, w: Widths) -> int:
+def alpha_of(power: Integer, reach: Integer, w: Widths) -> Integer:
     """2^(reach - power) / 255, at most 0.99; for 0 <= power <= reach."""
     x = w.log2_255 - (reach - power)
     if x < 0:
         return w.alpha_max
-    rest_bits = w.power - w.index
-    index = (x >> rest_bits) & ((1 << w.index) - 1)
+    rest_bits = w.power - w.index_bits
+    index = (x >> rest_bits) & ((1 << w.index_bits) - 1)
     rest = x & ((1 << rest_bits) - 1)
     value = w.table[index] - rounded(w.slopes[index] * rest, rest_bits)
     return min(rounded(value, TABLE_FRACTION_BITS - w.alpha + (x >> w.power)), w.alpha_max)
 
 
 @njit(inline="always")
-def weight_of(alpha: int, transmittance: int, w: Widths) -> int:
+def weight_of(alpha: Integer, transmittance: Integer, w: Widths) -> Integer:
     """alpha x transmittance, with the fraction of the transmittance, which then loses it."""
     return rounded(alpha * transmittance, w.alpha)
 
@@ -148,7 +151,7 @@ class _Job(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy")
-def _tile_corner(job: _Job, row: int, column: int) -> tuple[int, int]:
+def _tile_corner(job: _Job, row: Integer, column: Integer) -> tuple[Integer, Integer]:
     """Centre of a tile's first pixel, with the fraction of the centres."""
     half = (_ONE << job.widths.centre) >> 1
     x, y = job.origin + column * job.tile, row * job.tile

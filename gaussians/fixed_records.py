@@ -93,8 +93,8 @@ def encode(features: Float32, f: FixedFormat) -> tuple[Int32, tuple[int, int, in
     records[:, RED : BLUE + 1], bright = fixed(
         features[:, RED : BLUE + 1], f.colour_fraction, colour_limit
     )
-    over = (far, sharp, opaque, bright.any(axis=1))
-    return records, tuple(int(where.sum()) for where in over)
+    vivid = bright.any(axis=1)
+    return records, (int(far.sum()), int(sharp.sum()), int(opaque.sum()), int(vivid.sum()))
 
 
 def fixed(values: Float32, fraction: int, high: int) -> tuple[Int32, Bool]:
