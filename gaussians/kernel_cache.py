@@ -15,8 +15,6 @@ SHARED_SOURCES = (
     "gaussians/footprints.py",
     "gaussians/lanes.py",
     "lod_cloud/criterion.py",
-    "lod_cloud/search/marks.py",
-    "lod_cloud/search/sectors.py",
 )
 
 
