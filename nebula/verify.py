@@ -16,6 +16,7 @@ from gaussians.scene import Scene
 from gaussians.stereo_causes import CAUSES, isolated, ladder
 from gaussians.stereo_method import PRESETS, StereoMethod, parse_method
 from gaussians.synthetic import HOSTILE
+from nebula.memory import keep_freed_memory
 from nebula.options import VerifyOptions
 from nebula.output import CommandResult, OutputDirectory
 from nebula.progress import progress
@@ -56,6 +57,7 @@ class _Subject:
 def run(options: VerifyOptions) -> CommandResult:
     """Write verify.json, .csv and .md, chart.png and the pictures of the first view."""
     methods = _methods(options)
+    keep_freed_memory()
     with OutputDirectory(options.out) as out:
         subjects = list(_subjects(options))
         alone = () if options.mode == "hostile" else _BASELINES
