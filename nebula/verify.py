@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,8 @@ from nebula.verification.tally import MethodTally
 
 # Both eyes on their own, by each kind of list: what sharing has to beat.
 _BASELINES = tuple(
-    parse_method(f"independent,intersection={kind}") for kind in ("square_3sigma", "obb", "ellipse")
+    replace(PRESETS["independent"], name=f"independent {kind}", intersection=kind)
+    for kind in ("square_3sigma", "obb", "ellipse")
 )
 
 
