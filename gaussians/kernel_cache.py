@@ -15,6 +15,10 @@ SHARED_SOURCES = (
     "gaussians/footprints.py",
     "gaussians/lanes.py",
     "lod_cloud/criterion.py",
+    "lod_cloud/moments.py",
+    "lod_cloud/search/marks.py",
+    "lod_cloud/search/prefetching.py",
+    "lod_cloud/search/sectors.py",
 )
 
 

@@ -1,40 +1,50 @@
 """Which splats, and getting them across: LoD tree, search, Δcut, codec, link, both endpoints."""
 
-from lod_cloud.build import build_tree
+from lod_cloud.build import BuildOptions, BuildTimes, build_tree, build_tree_files
 from lod_cloud.client import Client, ReceiveStats, Selection
 from lod_cloud.cloud import Cloud, SearchStats, TreeEncoder
 from lod_cloud.codec import PaperCodec
 from lod_cloud.criterion import SearchRequest, prove_nesting
 from lod_cloud.cut import Cut, difference, is_complete, overlap
 from lod_cloud.delta_cut import DeltaCut, ManagementTable
-from lod_cloud.full_search import flat_search
+from lod_cloud.leaf_spool import LeafSpool
 from lod_cloud.link import Link
 from lod_cloud.lod_tree import LodTree, TreeMetadata
 from lod_cloud.protocol import RemoteProtocolError
-from lod_cloud.tree_files import load_tree, save_tree
+from lod_cloud.search import Search, SearchResult, SearchTree, flat_search, make_search
+from lod_cloud.tree_files import load_tree, save_tree, verify_tree
 
 __all__ = [
+    "BuildOptions",
+    "BuildTimes",
     "Client",
     "Cloud",
     "Cut",
     "DeltaCut",
+    "LeafSpool",
     "Link",
     "LodTree",
     "ManagementTable",
     "PaperCodec",
     "ReceiveStats",
     "RemoteProtocolError",
+    "Search",
     "SearchRequest",
+    "SearchResult",
     "SearchStats",
+    "SearchTree",
     "Selection",
     "TreeEncoder",
     "TreeMetadata",
     "build_tree",
+    "build_tree_files",
     "difference",
     "flat_search",
     "is_complete",
     "load_tree",
+    "make_search",
     "overlap",
     "prove_nesting",
     "save_tree",
+    "verify_tree",
 ]

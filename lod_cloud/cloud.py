@@ -13,10 +13,10 @@ from lod_cloud.codec import PaperCodec
 from lod_cloud.criterion import SearchRequest
 from lod_cloud.cut import Cut, difference
 from lod_cloud.delta_cut import DeltaCut, ManagementTable
-from lod_cloud.full_search import flat_search
 from lod_cloud.lod_tree import Int32, LodTree
 from lod_cloud.node_records import NodeRecords
 from lod_cloud.protocol import DELTA_CUT, SESSION_START, seal
+from lod_cloud.search import flat_search
 from lod_cloud.session import SessionStart
 
 

@@ -53,6 +53,12 @@ LEAVES = click.IntRange(1_000, 20_000_000)
 PIXELS = click.IntRange(1, 16_384)
 FOV_DEG = _Finite(min=1, max=170)
 METHODS = click.Choice(["exact", "paper", "independent"])
+SEARCH_METHODS = click.Choice(
+    [
+        *("flat", "depth_first", "streaming", "temporal", "validity", "wheel", "auto"),
+        *("octree_gs", "city_gaussian"),
+    ]
+)
 UP_AXES = click.Choice(["+x", "-x", "+y", "-y", "+z", "-z"])
 
 
@@ -100,17 +106,19 @@ baseline_option = click.option(
     show_default=True,
     help="Between the eyes, m.",
 )
+trace_option = click.option(
+    "--trace",
+    metavar="NAME|CSV",
+    help="stand, walk, flight, teleport or an EyeNavGS recording.  [default: walk]",
+)
+tau_option = click.option(
+    "--tau", "tau_px", type=NOT_NEGATIVE, default=6.0, show_default=True, help="LoD, px."
+)
 trace_options = _options(
-    click.option(
-        "--trace",
-        metavar="NAME|CSV",
-        help="stand, walk, flight, teleport or an EyeNavGS recording.  [default: walk]",
-    ),
+    trace_option,
     click.option("--frames", type=COUNT, default=12, show_default=True),
     click.option("--search-every", type=COUNT, default=4, show_default=True, help="Frames."),
-    click.option(
-        "--tau", "tau_px", type=NOT_NEGATIVE, default=6.0, show_default=True, help="LoD, px."
-    ),
+    tau_option,
 )
 method_option = click.option("--method", type=METHODS, default="exact", show_default=True)
 accelerator_option = click.option(
@@ -240,6 +248,7 @@ def verify(context: click.Context, json_target: str | None, **values: Any) -> No
 @click.argument("file", required=False)
 @scene_options
 @seed_option
+@click.option("--verify", is_flag=True, help="Read every byte of a tree and check it.")
 @json_option
 def info(file: str | None, json_target: str | None, **values: Any) -> None:
     """Say what is in a scene or a tree; FILE is the same as --scene FILE."""
@@ -284,14 +293,45 @@ def convert(source: str, up: str | None, json_target: str | None, **values: Any)
 
 @cli.command("build-tree")
 @scene_options
+@click.option(
+    "--tiled",
+    metavar="NAME|FILE",
+    help="Large city from configs/trees/: city, dense_city. --city-leaves changes its size.",
+)
+@click.option("--sh-degree", type=click.IntRange(0, 3), help="Of a tiled city.  [default: 3]")
+@click.option(
+    "--pair-within",
+    type=click.IntRange(1, 64),
+    default=16,
+    show_default=True,
+    help="Cheapest pairs first in groups of so many leaves; 1: medians to the end.",
+)
+@click.option(
+    "--fan-out-ratio",
+    type=_Finite(min=0, max=1, min_open=True),
+    default=1.0,
+    show_default=True,
+    help="Leave out nodes above this share of their parent's size, such as 0.7.",
+)
 @seed_option
 @threads_option
 @out_option(None)
 @json_option
-def build_tree(json_target: str | None, **values: Any) -> None:
+def build_tree(
+    tiled: str | None, sh_degree: int | None, json_target: str | None, **values: Any
+) -> None:
     """Build the level-of-detail tree of a scene."""
-    from nebula.options import BuildTreeOptions
+    from nebula.options import BuildTreeOptions, tiled_tree
 
+    if tiled is None and sh_degree is not None:
+        raise InputError("--sh-degree: of use for --tiled only, which is not given")
+    if tiled is not None:
+        leaves = values.pop("city_leaves")
+        idle = [key for key in (*_SCENE_KEYS, "config") if values.get(key) is not None]
+        if idle:
+            names = ", ".join(f"--{key.replace('_', '-')}" for key in idle)
+            raise InputError(f"--tiled brings its own scene; {names}: not of use")
+        values |= {"tiled": tiled_tree(tiled, leaves, sh_degree), "city_leaves": None}
     _execute("build_tree", BuildTreeOptions, values, json_target)
 
 
@@ -299,11 +339,23 @@ def build_tree(json_target: str | None, **values: Any) -> None:
 @click.option("--tree", required=True, type=click.Path(path_type=Path), metavar="DIR")
 @seed_option
 @view_options
-@trace_options
+@trace_option
+@click.option("--frames", type=COUNT, help="Of the trace.  [default: enough for 460 searches]")
+@click.option("--every", "search_every", type=COUNT, default=4, show_default=True, help="Frames.")
+@tau_option
+@click.option("--method", type=SEARCH_METHODS, default="auto", show_default=True, metavar="NAME")
+@click.option("--compare", is_flag=True, help="All methods and baseline rules, one after another.")
+@click.option(
+    "--hysteresis",
+    type=_Finite(min=0, max=0.05),
+    default=0.0,
+    show_default=True,
+    help="Share of its switching distance by which a node stays refined.",
+)
 @threads_option
 @json_option
 def search(json_target: str | None, **values: Any) -> None:
-    """Search a stored tree along a head trace."""
+    """Search a stored tree along a head trace; time methods and compare their cuts."""
     from nebula.options import SearchOptions
 
     _execute("search", SearchOptions, values, json_target)

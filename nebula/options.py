@@ -7,7 +7,7 @@ with after file, command line and defaults have been put together.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -119,10 +119,11 @@ class VerifyOptions:
 
 @dataclass(frozen=True)
 class InfoOptions:
-    """``nebula info``: what is in a scene."""
+    """``nebula info``: what is in a scene or a tree."""
 
     scene: SceneOptions
     seed: int
+    verify: bool = False  # every byte of a tree
 
 
 @dataclass(frozen=True)
@@ -139,12 +140,27 @@ class ConvertOptions:
 
 
 @dataclass(frozen=True)
+class TiledTree:
+    """One file of configs/trees/: a generated city too large for memory, and what is expected of
+    its tree.
+    """
+
+    leaves: int
+    density: Literal["city", "dense"]
+    sh_degree: int = 3
+    expected: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class BuildTreeOptions:
     """``nebula build-tree``: a scene to a tree directory."""
 
     scene: SceneOptions
     seed: int
     out: Path
+    tiled: TiledTree | None = None  # instead of the scene
+    pair_within: int = 16
+    fan_out_ratio: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -153,10 +169,13 @@ class SearchOptions:
 
     tree: Path
     scene: SceneOptions  # only view, display and trace count
-    frames: int
+    frames: int | None  # None: enough for 450 searches and those that are not counted
     tau_px: float
     search_every: int
     seed: int
+    method: str  # one of nebula.search.METHODS
+    compare: bool  # all methods, not only that one
+    hysteresis: float
 
 
 @dataclass(frozen=True)
@@ -229,6 +248,17 @@ def scene_options(
         near_m=_default(chosen["near_m"], NEAR_M),
         display=_display(given, file, default_display),
         trace=trace,
+    )
+
+
+def tiled_tree(name: str, leaves: int | None, sh_degree: int | None) -> TiledTree:
+    """A shipped name of configs/trees/ or a YAML file, with what is given put in its place."""
+    path = config_path(name, "trees")
+    tree = load_dataclass(TiledTree, load_yaml(path), path.stem)
+    return replace(
+        tree,
+        leaves=_default(leaves, tree.leaves),
+        sh_degree=_default(sh_degree, tree.sh_degree),
     )
 
 

@@ -19,7 +19,8 @@ from gaussians.render import render_stereo
 from gaussians.stereo_method import PRESETS
 from gaussians.synthetic import generate_city
 from gaussians.tiling import TileGrid, row_spans, tile_lists
-from lod_cloud import build_tree, prove_nesting
+from lod_cloud import SearchRequest, build_tree, prove_nesting
+from lod_cloud.search import SEARCHES, OctreeGsSearch, SearchTree, make_search
 from nebula import simulate
 from nebula.options import SimulateOptions, scene_options
 from tests.kernel_types import float64_variables, is_inlined, project_kernels
@@ -39,11 +40,24 @@ FLOAT64 = {
     "gaussians.tiling._column_span": "same",
     "gaussians.synthetic": "scenes are generated in float64 and rounded once",
     "lod_cloud.criterion._count_violations": "places the proof's cameras, then rounds them",
-    "lod_cloud.merge": "parents are merged in float64 and rounded once (sizes up)",
+    "lod_cloud.harmonics": "parents are merged in float64 and rounded once",
+    "lod_cloud.merge": "same; sizes are rounded up",
+    "lod_cloud.moments": "same",
+    "lod_cloud.search.sectors": "bounds on the camera's way; no decision is taken with them",
+    "lod_cloud.search.treelets._margin": "how long a decision holds, by a stated bound",
+    "lod_cloud.search.treelets.search_treelets": "keeps those margins; decisions are float32",
+    "lod_cloud.search.wheel_kernels._bucket": "how long a decision holds, by a stated bound",
+    "lod_cloud.search.wheel_kernels.collect": "moves the hands, rounded up",
+    "lod_cloud.search.wheel_kernels.insert": "how long a decision holds, by a stated bound",
 }
 # Of these, where float32 matters beside float64: the float64 variables by name.
 NAMES = {
     "gaussians.projection._project": {"det", "wide_xx", "wide_xy", "wide_yy"},
+    "lod_cloud.search.treelets.search_treelets": {"balls", "dx", "dy", "dz", "holds", "least"},
+    "lod_cloud.search.wheel_kernels.collect": {
+        *("step", "hands", "rates", "axes", "cosines", "sines"),
+        *("length", "advance", "along", "before", "now"),
+    },
     "lod_cloud.criterion._count_violations": {
         *("away", "unit", "distance", "length", "shell", "shells"),
     },
@@ -77,6 +91,7 @@ def kernels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         simulate.run(options)
     prove_nesting(build_tree(generate_city(1500, 0).scene))
     _render_otherwise()
+    _search_otherwise()
     return project_kernels()
 
 
@@ -89,6 +104,17 @@ def _render_otherwise() -> None:
     lists = tile_lists(row_spans(splats, grid), 0)
     for number_format in FORMATS.values():
         rasterise_in_format(number_format, splats.features[0], lists, grid)
+
+
+def _search_otherwise() -> None:
+    """Every search, first and incremental, with a change of settings."""
+    tree = SearchTree.of(build_tree(generate_city(1500, 0).scene))
+    for name in SEARCHES:
+        search = make_search(name, tree, hysteresis=0.01)
+        for step in range(60):
+            result = search.search(SearchRequest((0.05 * step, 0, 2), 900.0, 3.0 + (step == 30)))
+            assert len(result.cut) == result.cut_size and len(result.added) >= 0
+    OctreeGsSearch(tree).select(SearchRequest((0, 0, 2), 900.0, 6.0))
 
 
 @pytest.fixture(scope="module")

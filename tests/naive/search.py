@@ -6,6 +6,7 @@ import numpy as np
 
 from lod_cloud.criterion import SearchRequest
 from lod_cloud.lod_tree import LodTree
+from lod_cloud.search import SearchTree
 
 F = np.float32
 
@@ -68,3 +69,42 @@ def finest_complete_set(
         if not join:
             return drawn
         drawn = (drawn - {c for n in join for c in children(tree, n)}) | join
+
+
+def refined_nodes(
+    tree: SearchTree, request: SearchRequest, before: set[int], hysteresis: float = 0.0
+) -> set[int]:
+    """The refined set after a request, given the one before it: from the root, node by node.
+
+    Refined: inside the sphere of radius T, or refined before and inside the one of (1 + h) T.
+    """
+    refined: set[int] = set()
+    waiting = [0]
+    while waiting:
+        node = waiting.pop()
+        if tree.child_count[node] == 0:
+            continue
+        if _inside(tree, node, request, F(1)) or (
+            node in before and _inside(tree, node, request, F(1 + hysteresis))
+        ):
+            refined.add(node)
+            first = int(tree.first_child[node])
+            waiting += range(first, first + int(tree.child_count[node]))
+    return refined
+
+
+def cut_of(tree: SearchTree, refined: set[int]) -> list[int]:
+    """Nodes that are not refined and whose parent is, or the root; ascending."""
+    return [
+        node
+        for node in range(len(tree))
+        if node not in refined and (node == 0 or int(tree.parent[node]) in refined)
+    ]
+
+
+def _inside(tree: SearchTree, node: int, request: SearchRequest, grow: np.float32) -> bool:
+    """d2 < fl(T T) with T = fl(fl(g R) + fl(fl(g k) e))."""
+    k = F(request.focal_px / (2 * (request.tau_px + 0.5)))
+    t = F(F(grow * tree.radius[node]) + F(F(grow * k) * tree.extent[node]))
+    dx, dy, dz = (F(F(c) - m) for c, m in zip(request.position, tree.means[node], strict=True))
+    return bool(F(F(F(dx * dx) + F(dy * dy)) + F(dz * dz)) < F(t * t))

@@ -1,9 +1,8 @@
-"""`render`, `build-tree` and `search` as a user runs them, on small cities."""
+"""`render` and `build-tree` as a user runs them, on small cities."""
 
 from __future__ import annotations
 
 import json
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +16,12 @@ from gaussians.render import render_stereo
 from gaussians.stereo_method import PRESETS
 from gaussians.synthetic import generate_city
 from lod_cloud import load_tree
-from nebula import build_tree, render, search
+from nebula import build_tree, render
 from nebula.options import (
     BuildTreeOptions,
     GeneratedCity,
     RenderOptions,
     SceneOptions,
-    SearchOptions,
 )
 
 DISPLAY = Display.from_fov(80, 64, 96.0)
@@ -66,31 +64,6 @@ def test_a_stored_tree_is_the_tree_that_was_built(tree):
         loaded.gaussians.means[loaded.leaf_nodes()], generate_city(2000, 3).scene.means
     )
     assert len(loaded.metadata.path) > 2
-
-
-def test_search_walks_from_the_start_of_the_tree(tree):
-    options = SearchOptions(tree, scene(), frames=9, tau_px=30.0, search_every=4, seed=0)
-    rows = search.run(options).data["rows"]
-    assert [row["frame"] for row in rows] == [0, 4, 8]
-    assert rows[0]["added"] == rows[0]["cut_size"] < 2000 and rows[0]["overlap"] is None
-    for before, row in pairwise(rows):
-        assert row["cut_size"] == before["cut_size"] + row["added"] - row["removed"]
-        assert row["overlap"] == pytest.approx(1 - row["added"] / row["cut_size"])
-
-
-def test_search_from_another_view_finds_another_cut(tree):
-    near = SearchOptions(tree, scene(), frames=1, tau_px=30.0, search_every=1, seed=0)
-    far = SearchOptions(
-        tree, scene("0,0,500:0,10,0"), frames=1, tau_px=30.0, search_every=1, seed=0
-    )
-    sizes = [search.run(o).data["rows"][0]["cut_size"] for o in (near, far)]
-    assert sizes[1] < sizes[0]
-
-
-def test_a_directory_that_is_no_tree_is_refused(tmp_path):
-    options = SearchOptions(tmp_path, scene(), frames=1, tau_px=6.0, search_every=1, seed=0)
-    with pytest.raises(InputError, match=r"tree\.json: cannot be read"):
-        search.run(options)
 
 
 def test_another_directory_is_not_replaced_by_a_tree(tmp_path):
