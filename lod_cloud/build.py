@@ -1,30 +1,71 @@
-"""Builds the LoD tree of a scene by the rule of HierGS (doi:10.1145/3658160).
+"""Builds the LoD tree of a scene, in memory or straight into a directory.
 
-*Structure*: the Gaussians are split at the median of the longest axis of their means' box until
-one is left; equal coordinates are ordered by id. *Interior nodes*: the merge of their children
-(see `lod_cloud.merge`). *Node spheres*, float64 rounded up to float32, from the node's own
-3-sigma box (axis-aligned, centred at its mean) and its children's spheres:
+*Structure*: the Gaussians are split at the median of the longest axis of their means' box, as in
+HierGS (doi:10.1145/3658160), down to groups of ``pair_within`` neighbours, in which the cheapest
+pair merges first (`lod_cloud.merge`; 1 splits down to the leaves). Small steps can be left out
+(``fan_out_ratio``, `lod_cloud.numbering`). *Interior nodes*: the merge of their children. *Node
+spheres*, float64 rounded up to float32, from the node's own 3-sigma box (axis-aligned, centred at
+its mean) and its children's spheres:
 
     R = max(half diagonal of the box, max over children (R_ch + |m_ch - m|) (1 + 2^-19))
     e = max(longest side of the box,  max over children e_ch (1 + 2^-19))
+
+The same scene gives the same bits on any number of threads, in memory and on disk. Memory: about
+250 B per leaf beside scene and result; harmonics pass through in blocks.
 """
 
 from __future__ import annotations
 
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import numpy as np
-from numba import njit
 
 from gaussians.constants import OPACITY_LIMIT
 from gaussians.errors import InputError
 from gaussians.parallel import run_chunks
 from gaussians.scene import FIELDS, Scene
-from lod_cloud.criterion import LENGTH_LIMIT_M
+from lod_cloud.array_file import ArrayFile
+from lod_cloud.criterion import LENGTH_LIMIT_M, prove_nesting
+from lod_cloud.harmonics import MemoryRows, Rows, merge_harmonics
 from lod_cloud.lod_tree import Int32, LodTree, Point, TreeMetadata
-from lod_cloud.merge import merge_nodes
+from lod_cloud.merge import MOST_LEAVES, Nodes, merge_leaves
+from lod_cloud.numbering import Numbering, number_nodes
+from lod_cloud.split import split_order, upper_tree
+from lod_cloud.tree_files import TreeWriter
 
-NEST_MARGIN = 1.0 + 2.0**-19  # exceeds the rounding of the float32 node test
-_SERIAL_LEVELS = 5  # ranges of this level are split independently of each other
-_STACK = 64  # twice the depth of any tree of 2**31 leaves
+PAIR_WITHIN = 16
+_CHECKED_ROWS = 1 << 16
+_WRITTEN_ROWS = 1 << 16
+
+
+@dataclass(frozen=True)
+class BuildOptions:
+    """How leaves become a tree. Raises InputError for values out of range."""
+
+    pair_within: int = PAIR_WITHIN  # leaves of a group whose cheapest pairs merge first; 1: none
+    fan_out_ratio: float = 1.0  # nodes larger than this share of their parent are left out
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.pair_within <= MOST_LEAVES:
+            raise InputError(f"pair_within must lie in 1..{MOST_LEAVES}, not {self.pair_within}")
+        if not 0 < self.fan_out_ratio <= 1:
+            raise InputError(f"fan_out_ratio must lie in 0..1, not {self.fan_out_ratio}")
+
+
+_DEFAULT = BuildOptions()
+
+
+@dataclass(frozen=True)
+class BuildTimes:
+    """Seconds of a build into a directory: on the wall, unless said otherwise."""
+
+    build: float  # everything but the two below
+    user_cpu: float  # of all threads in that, outside the kernel: does not depend on other load
+    proof: float  # nesting
+    disk: float  # writing, reading back, checksums
 
 
 def build_tree(
@@ -34,178 +75,170 @@ def build_tree(
     units_per_metre: float = 1.0,
     start: Point | None = None,
     path: tuple[Point, ...] = (),
+    options: BuildOptions = BuildOptions(),  # frozen
 ) -> LodTree:
-    """LoD tree whose leaves are the scene's Gaussians; everything else is only recorded.
+    """LoD tree whose leaves are the scene's Gaussians; up, units, start, path are only recorded.
 
-    The same scene gives the same bits on any number of threads. Raises InputError for an empty or
-    invalid scene, for coordinates or sizes beyond 1e12 m, and where merged opacities exceed 1e6.
+    Raises InputError for an empty or invalid scene, for coordinates or sizes beyond 1e12 m, and
+    where merged opacities exceed 1e6.
     """
-    if len(scene) == 0:
-        raise InputError("a tree needs at least one Gaussian; the scene is empty")
-    scene.validate()
-    largest = max(float(np.abs(scene.means).max()), float(scene.scales.max()))
-    if largest > LENGTH_LIMIT_M:
-        raise InputError(
-            f"coordinates and scales must lie within {LENGTH_LIMIT_M:g} m, not {largest:g}"
-        )
-    parent, first_child, child_count, offsets, lows = _breadth_first_shape(len(scene))
-    leaf_id = np.where(child_count == 0, _split_order(scene, offsets, lows)[lows], -1)
-    leaf_id = leaf_id.astype(np.int32)
-    gaussians = _leaves_in_place(scene, leaf_id)
-    radius = np.zeros(len(parent), np.float32)
-    extent = np.zeros(len(parent), np.float32)
-    merge_nodes(gaussians, first_child, child_count, offsets, radius, extent, NEST_MARGIN)
-    densest = gaussians.opacities.max()
+    skeleton = _skeleton(scene, options)
+    numbering, nodes = skeleton.numbering, skeleton.nodes
+    sh = np.empty((len(numbering), *scene.sh.shape[1:]), np.float32)
+    merge_harmonics(
+        numbering, nodes, skeleton.leaf_id, _flat(scene), MemoryRows(sh.reshape(len(sh), -1))
+    )
+    arrays = {}
+    for name in Nodes._fields:
+        source = getattr(nodes, name)
+        arrays[name] = np.empty((len(numbering), *source.shape[1:]), np.float32)
+        run_chunks(_take, len(numbering), numbering.nodes, source, arrays[name])
+    gaussians = Scene(**{name: arrays[name] for name in FIELDS[:-1]}, sh=sh)
+    metadata = TreeMetadata(_bounds(scene), up, units_per_metre, start, path, _record(options))
+    return LodTree(
+        numbering.parent,
+        numbering.first_child,
+        numbering.child_count,
+        numbering.level_offsets,
+        gaussians,
+        arrays["radius"],
+        arrays["extent"],
+        skeleton.leaf_id,
+        metadata,
+    )
+
+
+def build_tree_files(
+    scene: Scene,
+    directory: str | os.PathLike[str],
+    *,
+    up: Point = (0.0, -1.0, 0.0),
+    units_per_metre: float = 1.0,
+    start: Point | None = None,
+    path: tuple[Point, ...] = (),
+    options: BuildOptions = _DEFAULT,
+    release: Callable[[], None] = lambda: None,
+) -> BuildTimes:
+    """The tree of `build_tree` as a directory, without ever holding its harmonics in memory.
+
+    The scene may be memory-mapped (`lod_cloud.leaf_spool`); ``release`` is called now and then
+    to let go of what was read of it. Nesting is proved on every edge before the directory takes
+    its name. Raises as `build_tree` and `save_tree` do, and RuntimeError if the proof failed.
+    """
+    begin, cpu = time.perf_counter(), os.times().user
+    skeleton = _skeleton(scene, options, release)
+    numbering = skeleton.numbering
+    metadata = TreeMetadata(_bounds(scene), up, units_per_metre, start, path, _record(options))
+    counts = {
+        "nodes": len(numbering),
+        "leaves": len(scene),
+        "levels": len(numbering.level_offsets) - 1,
+        "sh_degree": scene.sh_degree,
+    }
+    with TreeWriter(directory, counts, metadata) as writer:
+        for name in ("parent", "first_child", "child_count", "level_offsets"):
+            writer.put(name, getattr(numbering, name))
+        writer.put("leaf_id", skeleton.leaf_id)
+        for name in Nodes._fields:
+            source = getattr(skeleton.nodes, name)
+            file = writer.array(name, (len(numbering), *source.shape[1:]), np.float32)
+            run_chunks(_take_to_file, len(numbering), numbering.nodes, source, file)
+        rows: Rows = writer.array("sh", (len(numbering), *scene.sh.shape[1:]), np.float32)
+        merge_harmonics(numbering, skeleton.nodes, skeleton.leaf_id, _flat(scene), rows, release)
+        del skeleton
+        cpu_s = os.times().user - cpu
+        proof = time.perf_counter()
+        violations = prove_nesting(writer.tree())
+        if violations:
+            raise RuntimeError(f"the tree is not nested: {violations} violations; nothing is kept")
+        proof_s = time.perf_counter() - proof
+        disk_s = writer.finish()
+    return BuildTimes(time.perf_counter() - begin - disk_s - proof_s, cpu_s, proof_s, disk_s)
+
+
+@dataclass(frozen=True)
+class _Skeleton:
+    """Everything but harmonics."""
+
+    numbering: Numbering
+    nodes: Nodes
+    leaf_id: Int32  # [N] id in the scene, -1 for interior nodes
+
+
+def _skeleton(
+    scene: Scene, options: BuildOptions, release: Callable[[], None] = lambda: None
+) -> _Skeleton:
+    _check(scene, release)
+    group = min(options.pair_within, len(scene))
+    ids = split_order(scene.means, group)
+    upper = upper_tree(len(scene), group)
+    release()
+    nodes, children = merge_leaves(scene, ids, upper, release=release)
+    densest = nodes.opacities.max()
     if not densest <= OPACITY_LIMIT:
         raise InputError(
             f"merged opacities must not exceed {OPACITY_LIMIT:g}, not reach {densest:g}: "
             "too many Gaussians lie on top of each other"
         )
-    bounds = tuple(tuple(float(v) for v in f(scene.means, axis=0)) for f in (np.min, np.max))
-    metadata = TreeMetadata(
-        bounds,  # type: ignore[arg-type]  # two tuples of three by construction
-        up,
-        units_per_metre,
-        start,
-        path,
-        {"split": "median of the longest axis", "merge": "opacity x surface", "margin": "2^-19"},
-    )
-    return LodTree(
-        parent, first_child, child_count, offsets, gaussians, radius, extent, leaf_id, metadata
-    )
+    numbering = number_nodes(children, upper.root, nodes.extent, options.fan_out_ratio)
+    leaf_id = np.full(len(numbering), -1, np.int32)
+    leaves = np.flatnonzero(numbering.child_count == 0)
+    leaf_id[leaves] = ids[numbering.nodes[leaves]]
+    return _Skeleton(numbering, nodes, leaf_id)
 
 
-def _breadth_first_shape(count: int) -> tuple[Int32, Int32, Int32, Int32, Int32]:
-    """Shape of the median-split tree of ``count`` leaves, which no coordinate can change.
+def _check(scene: Scene, release: Callable[[], None]) -> None:
+    """In blocks, which needs little memory; the whole scene only to word the error."""
+    if len(scene) == 0:
+        raise InputError("a tree needs at least one Gaussian; the scene is empty")
 
-    Returns parent, first_child, child_count, level_offsets, and per node the first position of
-    its range in the order of the leaves from left to right.
-    """
-    nodes = 2 * count - 1
-    parent = np.full(nodes, -1, np.int32)
-    first_child = np.full(nodes, -1, np.int32)
-    child_count = np.zeros(nodes, np.int32)
-    lows = np.zeros(nodes, np.int32)
-    size = np.full(1, count, np.int32)
-    offsets = [0, 1]
-    while offsets[-1] < nodes:
-        begin, end = offsets[-2:]
-        inner = np.flatnonzero(size > 1).astype(np.int32)
-        below = end + 2 * len(inner)
-        first_child[begin + inner] = np.arange(end, below, 2, dtype=np.int32)
-        child_count[begin + inner] = 2
-        parent[end:below] = np.repeat(begin + inner, 2)
-        left = size[inner] // 2
-        lows[end:below:2] = lows[begin + inner]
-        lows[end + 1 : below : 2] = lows[begin + inner] + left
-        size = np.stack([left, size[inner] - left], axis=1).reshape(-1)
-        offsets.append(below)
-    return parent, first_child, child_count, np.array(offsets, np.int32), lows
+    def block(begin: int, end: int) -> float:
+        largest = 0.0
+        for low in range(begin, end, _CHECKED_ROWS):
+            rows = slice(low, min(low + _CHECKED_ROWS, end))
+            part = Scene(*(getattr(scene, f)[rows] for f in FIELDS)).validate()
+            largest = max(largest, float(np.abs(part.means).max()), float(part.scales.max()))
+            release()
+        return largest
+
+    try:
+        largest = max(run_chunks(block, len(scene)))
+    except InputError:
+        scene.validate()
+        raise
+    if largest > LENGTH_LIMIT_M:
+        raise InputError(
+            f"coordinates and scales must lie within {LENGTH_LIMIT_M:g} m, not {largest:g}"
+        )
 
 
-def _split_order(scene: Scene, offsets: Int32, lows: Int32) -> Int32:
-    """[count] ids of the scene's Gaussians, leaves from left to right."""
-    count = len(scene)
-    points = scene.means.copy()
-    ids = np.arange(count, dtype=np.int32)
-    top = min(_SERIAL_LEVELS, len(offsets) - 2)
-    _split_ranges(0, 1, np.array([0, count], np.int32), top, points, ids)
-    # where any node down to that level begins (leaves above it are ranges of one)
-    bounds = np.append(np.unique(lows[: offsets[top + 1]]), np.int32(count))
-    run_chunks(_split_ranges, len(bounds) - 1, bounds, _STACK, points, ids)
-    return ids
+def _bounds(scene: Scene) -> tuple[Point, Point]:
+    low, high = (tuple(float(v) for v in f(scene.means, axis=0)) for f in (np.min, np.max))
+    return low, high  # type: ignore[return-value]  # two tuples of three by construction
 
 
-def _leaves_in_place(scene: Scene, leaf_id: Int32) -> Scene:
-    """Node Gaussians with the leaves filled in; interior rows are still to be written (any
-    content).
-    """
-    arrays = (np.take(getattr(scene, f), leaf_id, axis=0, mode="clip") for f in FIELDS)
-    return Scene(*arrays)
+def _record(options: BuildOptions) -> dict[str, object]:
+    return {
+        "split": "median of the longest axis",
+        "merge": "opacity x surface",
+        "margin": "2^-19",
+        "pair_within": options.pair_within,
+        "fan_out_ratio": options.fan_out_ratio,
+    }
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _split_ranges(begin, end, bounds, levels, points, ids):  # type: ignore[no-untyped-def]
-    """Split each range bounds[i]..bounds[i + 1] at medians, ``levels`` levels deep."""
-    stack = np.empty((_STACK, 3), np.int64)
-    for piece in range(begin, end):
-        stack[0, 0] = bounds[piece]
-        stack[0, 1] = bounds[piece + 1]
-        stack[0, 2] = levels
-        depth = 1
-        while depth:
-            depth -= 1
-            low, high, left = stack[depth, 0], stack[depth, 1], stack[depth, 2]
-            if high - low < 2 or left == 0:
-                continue
-            middle = low + (high - low) // 2
-            _select(points, ids, _longest_axis(points, low, high), low, middle, high)
-            stack[depth, 0], stack[depth, 1], stack[depth, 2] = low, middle, left - 1
-            stack[depth + 1, 0], stack[depth + 1, 1] = middle, high
-            stack[depth + 1, 2] = left - 1
-            depth += 2
+def _flat(scene: Scene) -> np.ndarray:
+    return scene.sh.reshape(len(scene), -1)
 
 
-@njit
-def _longest_axis(points, low, high):  # type: ignore[no-untyped-def]
-    best = np.float32(-1.0)
-    longest = 0
-    for axis in range(3):
-        least = points[low, axis]
-        greatest = least
-        for i in range(low + 1, high):
-            value = points[i, axis]
-            if value < least:
-                least = value
-            if value > greatest:
-                greatest = value
-        if greatest - least > best:
-            best = greatest - least
-            longest = axis
-    return longest
+def _take_to_file(begin: int, end: int, ids: Int32, source: np.ndarray, file: ArrayFile) -> None:
+    for low in range(begin, end, _WRITTEN_ROWS):
+        high = min(low + _WRITTEN_ROWS, end)
+        rows = file.target(low, high).reshape(-1, *source.shape[1:])
+        np.take(source, ids[low:high], axis=0, out=rows, mode="clip")
+        file.write(low, rows)
 
 
-@njit
-def _less(value, number, pivot, pivot_number):  # type: ignore[no-untyped-def]
-    return value < pivot or (value == pivot and number < pivot_number)
-
-
-@njit
-def _swap(points, ids, i, j):  # type: ignore[no-untyped-def]
-    for axis in range(3):
-        points[i, axis], points[j, axis] = points[j, axis], points[i, axis]
-    ids[i], ids[j] = ids[j], ids[i]
-
-
-@njit
-def _select(points, ids, axis, low, middle, high):  # type: ignore[no-untyped-def]
-    """Quickselect by (coordinate, id): low..middle hold the smaller ones afterwards.
-
-    The order is total, so which ones they are does not depend on how this function works.
-    """
-    last = high - 1
-    while low < last:
-        centre = low + (last - low) // 2
-        if _less(points[centre, axis], ids[centre], points[low, axis], ids[low]):
-            _swap(points, ids, centre, low)
-        if _less(points[last, axis], ids[last], points[low, axis], ids[low]):
-            _swap(points, ids, last, low)
-        if _less(points[last, axis], ids[last], points[centre, axis], ids[centre]):
-            _swap(points, ids, last, centre)
-        pivot, pivot_id = points[centre, axis], ids[centre]
-        i, j = low, last
-        while i <= j:
-            while _less(points[i, axis], ids[i], pivot, pivot_id):
-                i += 1
-            while _less(pivot, pivot_id, points[j, axis], ids[j]):
-                j -= 1
-            if i <= j:
-                _swap(points, ids, i, j)
-                i += 1
-                j -= 1
-        if middle <= j:
-            last = j
-        elif middle >= i:
-            low = i
-        else:
-            return
+def _take(begin: int, end: int, ids: Int32, source: np.ndarray, out: np.ndarray) -> None:
+    # mode "clip" writes to ``out`` directly; every id is within the source
+    np.take(source, ids[begin:end], axis=0, out=out[begin:end], mode="clip")

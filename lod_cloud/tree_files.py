@@ -1,4 +1,11 @@
-"""A tree on disk: a directory of .npy arrays, which can be memory-mapped, and tree.json."""
+"""A tree on disk: a directory of .npy arrays, which can be memory-mapped, and tree.json.
+
+*What is checked when*: `load_tree` always compares every file's size with tree.json (truncated
+files are refused) and the checksum of tree.json itself. An array's own checksum is compared when
+the file is small, or when its modification time is no longer the one all files of a tree share
+since they were written (it was touched, altered, or copied without ``cp -p``). An undisturbed
+large tree is therefore opened without reading it; `verify_tree` reads every byte.
+"""
 
 from __future__ import annotations
 
@@ -8,20 +15,28 @@ import json
 import os
 import shutil
 import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from gaussians.errors import InputError
+from gaussians.parallel import threads
 from gaussians.scene import FIELDS, Scene
+from lod_cloud.array_file import ArrayFile
 from lod_cloud.lod_tree import ARRAYS, LodTree, Point, TreeMetadata
 
 FORMAT = "nebula LoD tree"
 VERSION = 1
 _DESCRIPTION = "tree.json"
 _READ_BYTES = 1 << 22
+_ALWAYS_CHECKED_BYTES = 1 << 24
+_BACKDATED_S = 10  # any later change gets a later time, however coarse the file system's clock
 
 
 def save_tree(tree: LodTree, directory: str | os.PathLike[str]) -> None:
@@ -31,82 +46,158 @@ def save_tree(tree: LodTree, directory: str | os.PathLike[str]) -> None:
     replaced, an empty directory used; any other existing file or directory raises InputError, and
     so does a place that cannot be written.
     """
-    target = Path(directory)
-    if target.exists() and not _replaceable(target):
-        raise InputError(f"{target}: must not exist, be empty, or hold a tree ({_DESCRIPTION})")
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        scratch = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
-    except OSError as error:
-        raise InputError(f"{target}: cannot be written: {error.strerror}") from error
-    try:
-        fresh = scratch / "new"
-        fresh.mkdir()
-        _write(tree, fresh)
-        if target.exists():
-            target.rename(scratch / "old")
-        fresh.rename(target)
-    except OSError as error:
-        if (scratch / "old").exists() and not target.exists():
-            (scratch / "old").rename(target)
-        raise InputError(f"{target}: cannot be written: {error.strerror}") from error
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+    counts = {
+        "nodes": len(tree),
+        "leaves": tree.leaves,
+        "levels": tree.levels,
+        "sh_degree": tree.sh_degree,
+    }
+    with TreeWriter(directory, counts, tree.metadata) as writer:
+        for name in ARRAYS:
+            writer.put(name, getattr(tree, name))
+        for name in FIELDS:
+            writer.put(name, getattr(tree.gaussians, name))
+        writer.finish()
 
 
 def load_tree(directory: str | os.PathLike[str]) -> LodTree:
     """The tree in ``directory``, memory-mapped (changes to its arrays stay in memory).
 
-    Every byte is compared with its checksum first. Raises InputError when a file is missing,
-    truncated, altered, or of an unknown version.
+    Memory and reading are those of the pages a user touches. Raises InputError when a file is
+    missing, truncated, known to be altered (see above), or of an unknown version.
     """
+    return _load(Path(directory), thorough=False)
+
+
+def verify_tree(directory: str | os.PathLike[str]) -> LodTree:
+    """`load_tree`, after every byte was compared with its checksum and every rule of `LodTree`."""
     source = Path(directory)
+    return _load(source, thorough=True).validate(str(source))
+
+
+def _load(source: Path, *, thorough: bool) -> LodTree:
     description = _read_description(source)
-    arrays = {
-        name: _read_array(source, name, entry) for name, entry in description["arrays"].items()
-    }
+    stamp = (source / _DESCRIPTION).stat().st_mtime_ns
     wanted = {*ARRAYS, *FIELDS}
-    if set(arrays) != wanted:
+    if set(description["arrays"]) != wanted:
         raise InputError(f"{source}: {_DESCRIPTION} must list the arrays {sorted(wanted)}")
+    arrays = {
+        name: _read_array(source, name, entry, None if thorough else stamp)
+        for name, entry in description["arrays"].items()
+    }
     scene = Scene(*(arrays.pop(name) for name in FIELDS))
     tree = LodTree(gaussians=scene, metadata=_metadata(description["metadata"]), **arrays)
-    counts = _counts(tree)
-    if counts != description["counts"]:
-        raise InputError(f"{source}: counts must be {description['counts']}, not {counts}")
+    counts = {"nodes": len(tree), "levels": tree.levels, "sh_degree": tree.sh_degree}
+    said = {name: description["counts"][name] for name in counts}
+    if counts != said or any(len(array) != len(tree) for array in _per_node(tree)):
+        raise InputError(f"{source}: counts must be {said}, not {counts}")
     return tree
+
+
+def _per_node(tree: LodTree) -> Iterator[NDArray[Any]]:
+    yield from (getattr(tree, name) for name in ARRAYS if name != "level_offsets")
+    yield from (getattr(tree.gaussians, name) for name in FIELDS)
+
+
+# ---------------------------------------------------------------- writing
+
+
+class TreeWriter:
+    """Writes a tree directory, all or nothing: it takes its name when the block ends well."""
+
+    def __init__(
+        self,
+        directory: str | os.PathLike[str],
+        counts: dict[str, int],
+        metadata: TreeMetadata,
+    ) -> None:
+        self._target = Path(directory)
+        self._counts, self._metadata = counts, metadata
+        self._files: dict[str, ArrayFile] = {}
+
+    def __enter__(self) -> TreeWriter:
+        target = self._target
+        if target.exists() and not _replaceable(target):
+            raise InputError(f"{target}: must not exist, be empty, or hold a tree ({_DESCRIPTION})")
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            self._scratch = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
+            self._fresh = self._scratch / "new"
+            self._fresh.mkdir()
+        except OSError as error:
+            raise InputError(f"{target}: cannot be written: {error.strerror}") from error
+        return self
+
+    def array(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> ArrayFile:
+        """A new array, to be filled before ``finish``."""
+        self._files[name] = ArrayFile(self._fresh / f"{name}.npy", shape, dtype)
+        return self._files[name]
+
+    def put(self, name: str, array: NDArray[Any]) -> None:
+        """A whole array."""
+        self.array(name, array.shape, array.dtype).write(0, array)
+
+    def tree(self) -> LodTree:
+        """What was written so far, memory-mapped; every array must be there."""
+        arrays = {name: file.mapped() for name, file in self._files.items()}
+        scene = Scene(*(arrays.pop(name) for name in FIELDS))
+        return LodTree(gaussians=scene, metadata=self._metadata, **arrays)
+
+    def finish(self) -> float:
+        """Checksums and tree.json; returns the seconds of everything that was disk work."""
+        begin = time.perf_counter()
+        seconds = sum(file.seconds for file in self._files.values()) / threads()
+        for file in self._files.values():
+            file.close()
+        with ThreadPoolExecutor(threads()) as pool:
+            digests = pool.map(_sha256, (file.path for file in self._files.values()))
+            entries = {
+                name: {"bytes": file.path.stat().st_size, "sha256": digest}
+                for (name, file), digest in zip(self._files.items(), digests, strict=True)
+            }
+        description: dict[str, Any] = {
+            "format": FORMAT,
+            "version": VERSION,
+            "counts": self._counts,
+            "metadata": dataclasses.asdict(self._metadata),
+            "arrays": dict(sorted(entries.items())),
+        }
+        description["sha256"] = _digest(description)
+        text = json.dumps(description, indent=1, allow_nan=False)
+        (self._fresh / _DESCRIPTION).write_text(text, encoding="utf-8")
+        stamp = (int(time.time()) - _BACKDATED_S) // 2 * 2  # some file systems count in 2 s
+        for path in self._fresh.iterdir():
+            os.utime(path, (stamp, stamp))
+        return seconds + time.perf_counter() - begin
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            for file in self._files.values():
+                file.close()
+            if kind is None:
+                if self._target.exists():
+                    self._target.rename(self._scratch / "old")
+                self._fresh.rename(self._target)
+        except OSError as problem:
+            error = problem
+            if (self._scratch / "old").exists() and not self._target.exists():
+                (self._scratch / "old").rename(self._target)
+        finally:
+            shutil.rmtree(self._scratch, ignore_errors=True)
+        if isinstance(error, OSError):
+            raise InputError(f"{self._target}: cannot be written: {error.strerror}") from error
 
 
 def _replaceable(target: Path) -> bool:
     return target.is_dir() and ((target / _DESCRIPTION).is_file() or not any(target.iterdir()))
 
 
-def _write(tree: LodTree, folder: Path) -> None:
-    entries = {}
-    arrays = {name: getattr(tree, name) for name in ARRAYS}
-    arrays |= {name: getattr(tree.gaussians, name) for name in FIELDS}
-    for name, array in arrays.items():
-        path = folder / f"{name}.npy"
-        np.save(path, array, allow_pickle=False)
-        entries[name] = {"bytes": path.stat().st_size, "sha256": _sha256(path)}
-    description: dict[str, Any] = {
-        "format": FORMAT,
-        "version": VERSION,
-        "counts": _counts(tree),
-        "metadata": dataclasses.asdict(tree.metadata),
-        "arrays": entries,
-    }
-    description["sha256"] = _digest(description)
-    text = json.dumps(description, indent=1, allow_nan=False)
-    (folder / _DESCRIPTION).write_text(text, encoding="utf-8")
-
-
-def _counts(tree: LodTree) -> dict[str, int]:
-    return {
-        "nodes": len(tree),
-        "leaves": tree.leaves,
-        "levels": tree.levels,
-        "sh_degree": tree.sh_degree,
-    }
+# ---------------------------------------------------------------- reading
 
 
 def _metadata(fields: dict[str, Any]) -> TreeMetadata:
@@ -158,13 +249,15 @@ def _read_description(source: Path) -> dict[str, Any]:
     return description
 
 
-def _read_array(source: Path, name: str, entry: dict[str, Any]) -> NDArray[Any]:
+def _read_array(source: Path, name: str, entry: dict[str, Any], stamp: int | None) -> NDArray[Any]:
+    """One array; ``stamp`` is the modification time of an undisturbed file, None trusts none."""
     path = source / f"{name}.npy"
     try:
-        size = path.stat().st_size
-        if size != entry["bytes"]:
-            raise InputError(f"{path}: must have {entry['bytes']} bytes, not {size}")
-        if _sha256(path) != entry["sha256"]:
+        status = path.stat()
+        if status.st_size != entry["bytes"]:
+            raise InputError(f"{path}: must have {entry['bytes']} bytes, not {status.st_size}")
+        trusted = status.st_size > _ALWAYS_CHECKED_BYTES and status.st_mtime_ns == stamp
+        if not trusted and _sha256(path) != entry["sha256"]:
             raise InputError(f"{path}: checksum must match; the file was altered")
         # copy-on-write rather than read-only: numba compiles read-only arrays separately
         return np.asarray(np.load(path, mmap_mode="c", allow_pickle=False))

@@ -14,7 +14,7 @@ from gaussians.constants import OPACITY_MIN
 from gaussians.errors import InputError
 from gaussians.placement import auto_view
 from gaussians.scene import Scene
-from lod_cloud import LodTree, load_tree, prove_nesting
+from lod_cloud import LodTree, load_tree, prove_nesting, verify_tree
 from nebula.options import InfoOptions
 from nebula.output import CommandResult
 from nebula.progress import progress
@@ -40,6 +40,8 @@ def run(options: InfoOptions) -> CommandResult:
     source = options.scene.scene
     if isinstance(source, Path) and (source / "tree.json").is_file():
         return _tree(source, options)
+    if options.verify:
+        raise InputError("--verify checks a tree directory; the scene is none")
     place = load(options.scene, options.seed)
     data = _describe(place)
     return CommandResult(data, _text(data))
@@ -222,34 +224,28 @@ def _tree(source: Path, options: InfoOptions) -> CommandResult:
             f"{source}: a tree knows its up axis and units; give no --level, --up, ..."
         )
     with progress(f"reading {source}"):
-        tree = load_tree(source)
+        tree = verify_tree(source) if options.verify else load_tree(source)
     with progress("proving nesting"):
         violations = prove_nesting(tree)
-    data = _describe_tree(tree, source, violations)
-    fan_out = ", ".join(f"{n} have {k}" for k, n in data["fan_out"].items())
-    text = (
-        f"{source}: {data['nodes']} nodes, {data['leaves']} leaves, {data['levels']} levels, "
-        f"spherical harmonics of degree {data['sh_degree']}\n"
-        f"children: {fan_out}\n"
-        f"on disk: {data['bytes_on_disk'] / 1e6:.1f} MB\n"
-        f"nesting: {violations} violations on {data['nodes'] - 1} edges"
-    )
-    return CommandResult(data, text)
+    data = _describe_tree(tree, source, violations) | {"verified": options.verify}
+    return CommandResult(data, _tree_text(data))
 
 
 def _describe_tree(tree: LodTree, source: Path, violations: int) -> dict[str, Any]:
-    children, nodes = np.unique(tree.child_count, return_counts=True)
+    nodes = np.bincount(tree.child_count)
     metadata = tree.metadata
+    sizes = {file.name: file.stat().st_size for file in sorted(source.iterdir()) if file.is_file()}
     return {
         "tree": str(source),
         "nodes": len(tree),
-        "leaves": tree.leaves,
+        "leaves": int(nodes[0]),
         "levels": tree.levels,
         "level_nodes": np.diff(tree.level_offsets).tolist(),
-        "fan_out": {str(k): int(n) for k, n in zip(children, nodes, strict=True)},
+        "fan_out": {str(k): int(n) for k, n in enumerate(nodes) if n},
         "sh_degree": tree.sh_degree,
         "opacities_above_one": int(np.count_nonzero(tree.gaussians.opacities > 1)),
-        "bytes_on_disk": sum(file.stat().st_size for file in source.iterdir() if file.is_file()),
+        "bytes_on_disk": sum(sizes.values()),
+        "bytes_of_files": sizes,
         "nesting_violations": violations,
         "bounds_m": metadata.bounds,
         "up": metadata.up,
@@ -257,3 +253,37 @@ def _describe_tree(tree: LodTree, source: Path, violations: int) -> dict[str, An
         "start_m": metadata.start,
         "build": metadata.build,
     }
+
+
+def _tree_text(data: dict[str, Any]) -> str:
+    inner = data["nodes"] - data["leaves"]
+    children = (data["nodes"] - 1) / max(inner, 1)
+    checked = "every byte matches its checksum" if data["verified"] else "sizes match"
+    lines = [
+        f"{data['tree']}: {data['nodes']} nodes, {data['leaves']} leaves, {data['levels']} levels, "
+        f"spherical harmonics of degree {data['sh_degree']}",
+        f"nodes per level: {', '.join(str(n) for n in data['level_nodes'])}",
+        f"children per interior node: {children:.2f}, opacity above 1 in "
+        f"{data['opacities_above_one']} of {inner}",
+        *_fan_out_lines({int(k): n for k, n in data["fan_out"].items()}),
+        f"on disk: {data['bytes_on_disk'] / 1e6:.1f} MB; {checked}",
+        *(f"  {name:18} {size:>14} B" for name, size in data["bytes_of_files"].items()),
+        f"built by: {', '.join(f'{k} {v}' for k, v in data['build'].items())}",
+        f"nesting: {data['nesting_violations']} violations on {data['nodes'] - 1} edges",
+    ]
+    return "\n".join(lines)
+
+
+def _fan_out_lines(fan_out: dict[int, int]) -> list[str]:
+    """A bar for 0, 1, 2, 3, 4, 5-8, 9-16, ... children."""
+    bins: dict[tuple[int, int], int] = {}
+    for children, nodes in fan_out.items():
+        high = children if children <= 4 else 1 << (children - 1).bit_length()
+        key = (high if high <= 4 else high // 2 + 1, high)
+        bins[key] = bins.get(key, 0) + nodes
+    most = max(bins.values())
+    lines = []
+    for (low, high), count in bins.items():
+        name = str(low) if low == high else f"{low}-{high}"
+        lines.append(f"  {name:>9} {count:>11}  {'#' * -(-_BAR * count // most)}")
+    return lines

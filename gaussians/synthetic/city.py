@@ -40,9 +40,9 @@ _SKY_SHARE, _SKY_MOST, _SKY_RADIUS_M = 0.015, 4_000, 170.0
 _NEAREST_M = 2.0  # density does not grow further towards the walker
 _LARGEST = 0.08  # standard deviation relative to the distance that sets the density
 _STEPS = (0.7548776662466927, 0.5698402909980532)  # additive recurrence of two dimensions
-_RICHNESS = np.ones(len(Material))  # splats per area, by how much there is to see
-_RICHNESS[[Material.FACADE, Material.ROAD, Material.PLAIN, Material.WALL]] = 2.4, 0.8, 0.6, 0.4
-_RICHNESS[[Material.GRASS, Material.ROOF, Material.ASPHALT]] = 0.35, 0.4, 0.6
+RICHNESS = np.ones(len(Material))  # splats per area, by how much there is to see
+RICHNESS[[Material.FACADE, Material.ROAD, Material.PLAIN, Material.WALL]] = 2.4, 0.8, 0.6, 0.4
+RICHNESS[[Material.GRASS, Material.ROOF, Material.ASPHALT]] = 0.35, 0.4, 0.6
 _BASE = Shape(reach=0.58, aspect=1.5, turn=0.05, jitter=0.08)
 _DETAIL = Shape(reach=0.50, aspect=2.5, turn=0.08, jitter=0.15)
 
@@ -108,15 +108,15 @@ class _Sampler:
     def __init__(self, geometry: Geometry) -> None:
         self.patches, self.crowns = geometry.patches, geometry.crowns
         self.ids, self.corners, self.sizes = _cells(self.patches)
-        centres = _on_patches(self.patches, self.ids, self.corners + 0.5 * self.sizes)
+        centres = on_patches(self.patches, self.ids, self.corners + 0.5 * self.sizes)
         area = self.sizes[:, 0] * self.sizes[:, 1]
         distance = walk_distance(centres)
-        value = self.patches.exposures * _RICHNESS[self.patches.materials]
+        value = self.patches.exposures * RICHNESS[self.patches.materials]
         weights = value[self.ids] * area / (distance * distance)
         self.most = np.concatenate([distance, walk_distance(self.crowns.centres)]) * _LARGEST
-        self.areas = np.concatenate([area, _leaf_area(self.crowns)])
+        self.areas = np.concatenate([area, leaf_area(self.crowns)])
         distance = walk_distance(self.crowns.centres)
-        leafy = self.crowns.exposures * _leaf_area(self.crowns) / (distance * distance)
+        leafy = self.crowns.exposures * leaf_area(self.crowns) / (distance * distance)
         self.weights = np.concatenate([weights, leafy])
 
     def sample(
@@ -169,7 +169,7 @@ def _cells(patches: Patches) -> tuple[Ids, Float64, Float64]:
     corners, sizes = np.zeros((len(patches), 2)), patches.lengths.copy()
     done: list[tuple[Ids, Float64, Float64]] = []
     while len(ids):
-        distance = walk_distance(_on_patches(patches, ids, corners + 0.5 * sizes))
+        distance = walk_distance(on_patches(patches, ids, corners + 0.5 * sizes))
         large = sizes.max(axis=1) > 0.4 * distance
         done.append((ids[~large], corners[~large], sizes[~large]))
         ids, corners, sizes = ids[large], corners[large], sizes[large]
@@ -183,13 +183,13 @@ def _cells(patches: Patches) -> tuple[Ids, Float64, Float64]:
     return ids, corners, sizes
 
 
-def _on_patches(patches: Patches, ids: Ids, place: Float64) -> Float64:
+def on_patches(patches: Patches, ids: Ids, place: Float64) -> Float64:
     """[Q, 3] world position of place [Q, 2] metres on the rectangles ids [Q]."""
     along = place[:, :1] * patches.axis_u[ids] + place[:, 1:] * patches.axis_v[ids]
     return patches.origins[ids] + along
 
 
-def _leaf_area(crowns: Crowns) -> Float64:
+def leaf_area(crowns: Crowns) -> Float64:
     """[K] square metres of leaves that close a crown to the eye: about its surface."""
     x, y, z = crowns.radii.T
     return 4.0 * (x * y + y * z + z * x)

@@ -59,6 +59,17 @@ def add_town(builder: GeometryBuilder) -> None:
     add_furniture(builder)
 
 
+def open_town(rng: np.random.Generator) -> Geometry:
+    """A town without outskirts and without houses across the main street, so that towns join."""
+    builder = GeometryBuilder(rng)
+    _main_street(builder)
+    _cross_street(builder)
+    _parallel_streets(builder)
+    _rows_of_houses(builder)
+    add_furniture(builder)
+    return builder.build()
+
+
 def _kerb(builder: GeometryBuilder, x0: float, x1: float, y: float, exposure: float) -> None:
     """Kerb face along x, facing the carriageway at smaller |y| (y > 0: facing -y)."""
     start, edge = (x0, x1 - x0) if y > 0 else (x1, x0 - x1)
@@ -137,6 +148,12 @@ def _soil(builder: GeometryBuilder) -> None:
 
 
 def _blocks(builder: GeometryBuilder) -> None:
+    _rows_of_houses(builder)
+    for end in (-1.0, 1.0):  # houses that close the view along the main street
+        _end_house(builder, end)
+
+
+def _rows_of_houses(builder: GeometryBuilder) -> None:
     inner, outer = STREET_HALF_M, PARALLEL_STREET_Y[0]
     for x0, x1 in _WEST_EAST:
         for side in (-1.0, 1.0):
@@ -146,8 +163,6 @@ def _blocks(builder: GeometryBuilder) -> None:
             for a, b in ((inner, outer), (PARALLEL_STREET_Y[1], HALF_EXTENT_M)):
                 low, high = sorted((side * a, side * b))
                 builder.floor((x0, low), (x1, high), KERB_M, Material.GRASS, _GRASS, 0.12)
-    for end in (-1.0, 1.0):  # houses that close the view along the main street
-        _end_house(builder, end)
 
 
 def _row(

@@ -16,10 +16,10 @@ from lod_cloud.cloud import Cloud
 from lod_cloud.codec import PaperCodec
 from lod_cloud.criterion import SearchRequest
 from lod_cloud.cut import is_complete
-from lod_cloud.full_search import flat_search
 from lod_cloud.lod_tree import LodTree
 from lod_cloud.node_records import NodeRecords
 from lod_cloud.protocol import RemoteProtocolError, seal
+from lod_cloud.search import flat_search
 from tests.lod_cloud.trees import random_tree, requests, walk
 from tests.naive import search as naive
 
@@ -171,7 +171,7 @@ def test_moving_back_restores_the_cut_from_what_is_held() -> None:
     client.receive(cloud.search(near, 4))
     assert cloud.cut is not None
     back = client.select(far)
-    assert back.coarsened == 4
+    assert back.coarsened == 2
     assert not np.array_equal(cloud.cut.node_ids, back.node_ids)
     assert np.array_equal(back.node_ids, flat_search(tree, far).node_ids)
 

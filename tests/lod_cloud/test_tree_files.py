@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from gaussians import parallel
 from gaussians.errors import InputError
 from gaussians.scene import FIELDS
-from lod_cloud.build import build_tree
+from lod_cloud import tree_files
+from lod_cloud.build import BuildOptions, build_tree, build_tree_files
 from lod_cloud.criterion import SearchRequest
-from lod_cloud.full_search import flat_search
+from lod_cloud.leaf_spool import LeafSpool
 from lod_cloud.lod_tree import ARRAYS
-from lod_cloud.tree_files import load_tree, save_tree
+from lod_cloud.search import flat_search
+from lod_cloud.tree_files import load_tree, save_tree, verify_tree
 from tests.lod_cloud.trees import random_scene, random_tree
 
 
@@ -67,7 +74,7 @@ def test_a_failed_save_leaves_the_old_tree(tmp_path: Path, monkeypatch: pytest.M
     def full_disk(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(np, "save", full_disk)
+    monkeypatch.setattr(os, "pwrite", full_disk)
     with pytest.raises(InputError, match="No space left"):
         save_tree(random_tree(7, 1), target)
     assert load_tree(target).leaves == 5
@@ -112,3 +119,126 @@ def test_damaged_descriptions(saved: Path) -> None:
     path.unlink()
     with pytest.raises(InputError, match="cannot be read"):
         load_tree(saved)
+
+
+@pytest.mark.parametrize("name", [*ARRAYS, *FIELDS])
+def test_large_undisturbed_files_are_opened_without_reading_them(
+    saved: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only `verify_tree` finds an alteration that restores the modification time."""
+    monkeypatch.setattr(tree_files, "_ALWAYS_CHECKED_BYTES", 0)
+    read = []
+    digest = tree_files._sha256
+    monkeypatch.setattr(tree_files, "_sha256", lambda path: read.append(path) or digest(path))
+    load_tree(saved)
+    assert read == []
+    assert time.time() - (saved / "tree.json").stat().st_mtime > 5  # later changes get later times
+    path = saved / f"{name}.npy"
+    data = path.read_bytes()
+    stamp = path.stat().st_mtime_ns
+    path.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))  # at once: the clock hardly moved
+    with pytest.raises(InputError, match=f"{name}.npy: checksum must match"):
+        load_tree(saved)
+    assert read == [path]
+    os.utime(path, ns=(stamp, stamp))
+    load_tree(saved)
+    with pytest.raises(InputError, match=f"{name}.npy: checksum must match"):
+        verify_tree(saved)
+    path.write_bytes(data[:-1])
+    os.utime(path, ns=(stamp, stamp))
+    with pytest.raises(InputError, match=f"{name}.npy: must have {len(data)} bytes"):
+        load_tree(saved)
+    path.write_bytes(data)
+    verify_tree(saved)
+
+
+def test_a_copied_tree_is_read_once_more(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tree_files, "_ALWAYS_CHECKED_BYTES", 0)
+    now = time.time_ns()
+    for number, path in enumerate(sorted(saved.iterdir())):
+        os.utime(path, ns=(now + number, now + number))
+    assert load_tree(saved).leaves == 20
+
+
+@pytest.mark.parametrize("options", [BuildOptions(), BuildOptions(1), BuildOptions(16, 0.7)])
+def test_a_tree_built_into_files_is_the_one_built_in_memory(
+    tmp_path: Path, options: BuildOptions
+) -> None:
+    """On any number of threads, from memory or from a spool filled in pieces."""
+    scene = random_scene(40_000, 9)
+    before = parallel.threads()
+    try:
+        for count in (1, 3):
+            parallel.set_threads(count)
+            build_tree_files(scene, tmp_path / f"by {count}", options=options)
+    finally:
+        parallel.set_threads(before)
+    (tmp_path / "spool").mkdir()
+    spool = LeafSpool(tmp_path / "spool", len(scene), scene.sh_degree)
+    for low in range(0, len(scene), 7777):
+        spool.append(scene.take(np.arange(low, min(low + 7777, len(scene)))))
+    build_tree_files(spool.scene(), tmp_path / "spooled", options=options, release=spool.release)
+    save_tree(build_tree(scene, options=options), tmp_path / "memory")
+    for path in (tmp_path / "memory").iterdir():
+        for other in ("by 1", "by 3", "spooled"):
+            assert path.read_bytes() == (tmp_path / other / path.name).read_bytes(), path.name
+    verify_tree(tmp_path / "by 1")
+
+
+def test_a_spool_is_filled_exactly(tmp_path: Path) -> None:
+    with LeafSpool(tmp_path, 10, 1) as spool:
+        spool.append(random_scene(6, 1))
+        with pytest.raises(InputError, match="must hold 10 leaves, not 6"):
+            spool.scene()
+        with pytest.raises(InputError, match="a spool of 10 leaves must not be given 12"):
+            spool.append(random_scene(6, 2))
+
+
+MEMORY = """
+import sys
+from pathlib import Path
+import numpy as np
+from gaussians.parallel import set_threads
+from gaussians.scene import Scene
+from lod_cloud import LeafSpool, SearchRequest, build_tree_files, load_tree
+from lod_cloud.search import flat_search
+from tests.lod_cloud.trees import random_scene
+
+def peak_mb():
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1e3
+
+def build(count, folder):
+    folder.mkdir()
+    spool = LeafSpool(folder, count, 3)
+    for number in range(count // 10_000):
+        piece = random_scene(10_000, number, sh_degree=3)
+        piece.means[:, 0] += 100 * number  # neighbours in the spool are neighbours in space
+        spool.append(piece)
+    build_tree_files(spool.scene(), folder / "tree", release=spool.release)
+    return peak_mb()
+
+def search(folder):
+    flat_search(load_tree(folder / "tree"), SearchRequest((0, 0, 0), 900, 6))
+    return peak_mb()
+
+set_threads(2)
+folder = Path(sys.argv[1])
+if sys.argv[2] == "build":
+    print(build(10_000, folder / "small"), build(200_000, folder / "large"))
+else:
+    print(search(folder / "small"), search(folder / "large"))
+"""
+
+
+def test_neither_building_nor_searching_holds_the_harmonics(tmp_path: Path) -> None:
+    """Peak memory per leaf added, where a leaf and its share of nodes are 790 B on disk."""
+    for what, most in (("build", 400), ("search", 150)):
+        done = subprocess.run(
+            [sys.executable, "-c", MEMORY, str(tmp_path), what],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        small, large = (float(value) for value in done.stdout.split())
+        assert (large - small) * 1e6 / 190_000 < most, what

@@ -33,6 +33,37 @@ def leaf_sets(scene: Scene, ids: list[int]) -> set[frozenset[int]]:
     return {frozenset(ids)} | left | right
 
 
+def grouped_leaf_sets(scene: Scene, ids: list[int], group: int) -> set[frozenset[int]]:
+    """The leaves below every node, where groups of at most ``group`` merge the cheapest pair."""
+    if len(ids) <= group:
+        return _paired_leaf_sets(scene, ids)
+    ordered = leaf_order(scene, ids)
+    half = len(ids) // 2
+    left = grouped_leaf_sets(scene, ordered[:half], group)
+    right = grouped_leaf_sets(scene, ordered[half:], group)
+    return {frozenset(ids)} | left | right
+
+
+def _paired_leaf_sets(scene: Scene, ids: list[int]) -> set[frozenset[int]]:
+    """Sum of the principal 2 x 2 minors of the merge, times (1 + |colour difference|^2)^2."""
+    slots = [frozenset([i]) for i in ids]
+    found = set(slots)
+    while len(slots) > 1:
+        pairs = [(a, b) for i, a in enumerate(slots) for b in slots[:i]]
+        a, b = min(pairs, key=lambda pair: _pair_cost(scene, *pair))
+        slots = [s for s in slots if s not in (a, b)] + [a | b]
+        found.add(a | b)
+    return found
+
+
+def _pair_cost(scene: Scene, a: frozenset[int], b: frozenset[int]) -> float:
+    both = [merge(scene.take(np.array(sorted(s)))) for s in (a, b)]
+    c = merge(scene.take(np.array(sorted(a | b)))).covariance
+    minors = sum(c[i, i] * c[j, j] - c[i, j] ** 2 for i, j in ((0, 1), (0, 2), (1, 2)))
+    colour = both[0].sh[0] - both[1].sh[0]
+    return float(minors * (1 + colour @ colour) ** 2)
+
+
 @dataclass(frozen=True)
 class Merged:
     mean: Float64

@@ -1,0 +1,268 @@
+"""Cities of any size at one density, generated tile by tile in bounded memory.
+
+Towns of 160 m x 160 m (`layout`) stand side by side, each with houses of its own; their main
+streets join. Of this plane a square around the origin is filled so that it holds the wanted
+number of splats per square metre of ground. Unlike `city.generate_city`, density does not depend
+on where a walker goes: this is what level-of-detail searches are measured on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gaussians.errors import InputError
+from gaussians.parallel import run_chunks
+from gaussians.scene import Scene
+from gaussians.synthetic.city import EYE_HEIGHT_M, RICHNESS, leaf_area, on_patches
+from gaussians.synthetic.layout import HALF_EXTENT_M, open_town
+from gaussians.synthetic.noise import near_normal, systematic_counts
+from gaussians.synthetic.patches import Crowns, Geometry
+from gaussians.synthetic.splats import (
+    OPAQUE_SHARE,
+    Chunk,
+    Shape,
+    assemble,
+    leaf_splats,
+    opaque,
+    surface_splats,
+    translucent,
+)
+
+Float64 = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+TOWN_M = 2 * HALF_EXTENT_M
+MIN_LEAVES, MAX_LEAVES = 1_000, 200_000_000
+_TILE_LEAVES = 400_000  # generated at a time
+_SORT_M = 10.0  # tiles are made of squares of this edge
+_PATH_STEP_M = 1.0
+_PATH_MOST_M = 400.0
+_COARSEST = 40.0  # a size from the tail of the distribution, relative to the smallest
+_PLAIN = Shape(reach=1.0, aspect=1.8, turn=0.06, jitter=0.12)
+
+
+@dataclass(frozen=True)
+class CityDensity:
+    """How finely a tiled city is resolved."""
+
+    leaves_per_m2: float  # of ground
+    cell_m: float  # surfaces are cut into cells of at most this edge
+    base: float  # spread of the covering splats relative to the distance between them
+    detail: float  # least spread of the others, relative to that distance
+    tail: float  # exponent of their sizes: spread = least / u ** tail, u uniform in 0..1
+
+
+DENSITIES = {
+    "city": CityDensity(leaves_per_m2=5.0, cell_m=16.0, base=0.55, detail=0.30, tail=0.30),
+    "dense": CityDensity(leaves_per_m2=212.0, cell_m=2.5, base=0.50, detail=0.29, tail=0.60),
+}
+
+
+@dataclass(frozen=True)
+class TiledCity:
+    """A city of exactly ``leaves`` splats; the same bits for the same fields everywhere.
+
+    Raises InputError for values out of range.
+    """
+
+    leaves: int
+    density: str  # of DENSITIES
+    seed: int = 0
+    sh_degree: int = 3
+
+    def __post_init__(self) -> None:
+        if not MIN_LEAVES <= self.leaves <= MAX_LEAVES:
+            raise InputError(
+                f"city leaves must lie in {MIN_LEAVES}..{MAX_LEAVES}, not {self.leaves}"
+            )
+        if self.density not in DENSITIES:
+            raise InputError(f"density must be one of {', '.join(DENSITIES)}, not {self.density!r}")
+        if self.seed < 0:
+            raise InputError(f"city seed must be an integer >= 0, not {self.seed}")
+        if self.sh_degree not in (0, 1, 2, 3):
+            raise InputError(f"sh_degree must be 0, 1, 2 or 3, not {self.sh_degree}")
+
+    @property
+    def half_m(self) -> float:
+        """Half the edge of the square of ground that is filled."""
+        return 0.5 * math.sqrt(self.leaves / DENSITIES[self.density].leaves_per_m2)
+
+    @property
+    def path(self) -> Float64:
+        """[P, 3] metres: eye positions of a walk along the main street, 1 m apart."""
+        reach = min(0.8 * self.half_m, 0.5 * _PATH_MOST_M)
+        x = np.arange(-reach, reach + 0.5 * _PATH_STEP_M, _PATH_STEP_M)
+        return np.column_stack([x, np.full(len(x), 1.0), np.full(len(x), EYE_HEIGHT_M)])
+
+    @property
+    def target(self) -> Float64:
+        """[3] metres: what the first view looks at, ahead on the walk."""
+        eye: Float64 = self.path[0]
+        return eye + np.array([10.0, 0.5, 0.1])
+
+    def tiles(self) -> Iterator[Scene]:
+        """All splats, tile by tile: a few hundred thousand that stand together at a time."""
+        towns = self._towns()
+        weights = np.array([_overlap(*town, self.half_m) for town in towns])
+        counts = systematic_counts(weights, self.leaves, 0.5)
+        for town, count in zip(towns, counts, strict=True):
+            if count:
+                yield from _town_tiles(self, town, int(count))
+
+    def _towns(self) -> list[tuple[int, int]]:
+        """Positions of the towns the square meets, in units of their edge, row by row."""
+        reach = math.ceil(max(0.0, self.half_m / TOWN_M - 0.5))
+        span = range(-reach, reach + 1)
+        return [(x, y) for y in span for x in span]
+
+
+def _overlap(x: int, y: int, half_m: float) -> float:
+    """Square metres of a town inside the square."""
+    edges = []
+    for at in (x, y):
+        low, high = (at - 0.5) * TOWN_M, (at + 0.5) * TOWN_M
+        edges.append(max(0.0, min(high, half_m) - max(low, -half_m)))
+    return edges[0] * edges[1]
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """Pieces of rectangles and whole crowns of one town, those inside the square."""
+
+    patch: Ids  # [C] rectangle, or -1 - crown
+    corners: Float64  # [C, 2] metres on the rectangle
+    sizes: Float64  # [C, 2]
+    areas: Float64  # [C] square metres to cover
+    weights: Float64  # [C]
+
+    def take(self, rows: Ids) -> _Cells:
+        return _Cells(*(getattr(self, f)[rows] for f in self.__dataclass_fields__))
+
+
+def _town_tiles(city: TiledCity, town: tuple[int, int], count: int) -> Iterator[Scene]:
+    rng = _generator(city.seed, town, 0)
+    geometry = _moved(open_town(rng), town)
+    density = DENSITIES[city.density]
+    cells = _cells(geometry, density.cell_m, city.half_m)
+    counts = systematic_counts(cells.weights, count, float(rng.random()))
+    edges = np.searchsorted(np.cumsum(counts), np.arange(0, count, _TILE_LEAVES), side="right")
+    bounds = np.unique(np.append(edges, len(counts)))
+    pieces = len(bounds) - 1
+    scenes: list[Scene | None] = [None] * pieces
+
+    def generate(begin: int, end: int) -> None:
+        for piece in range(begin, end):
+            rows = np.arange(bounds[piece], bounds[piece + 1])
+            own = _generator(city.seed, town, 1 + piece)
+            chunks = _sample(own, geometry, cells.take(rows), counts[rows], density)
+            scenes[piece] = assemble(own, chunks, city.sh_degree)
+
+    for first in range(0, pieces, 16):  # as many at a time as keep all threads busy
+        last = min(first + 16, pieces)
+        run_chunks(lambda b, e, first=first: generate(first + b, first + e), last - first)
+        for piece in range(first, last):
+            scene, scenes[piece] = scenes[piece], None
+            if scene is not None and len(scene):
+                yield scene
+
+
+def _generator(seed: int, town: tuple[int, int], piece: int) -> np.random.Generator:
+    """Independent of all others; entropy must not be negative."""
+    key = [seed, *(2 * abs(v) + (v < 0) for v in town), piece]
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(key)))
+
+
+def _moved(geometry: Geometry, town: tuple[int, int]) -> Geometry:
+    shift = TOWN_M * np.array([town[0], town[1], 0.0])
+    patches = replace(geometry.patches, origins=geometry.patches.origins + shift)
+    return Geometry(patches, replace(geometry.crowns, centres=geometry.crowns.centres + shift))
+
+
+def _cells(geometry: Geometry, most_m: float, half_m: float) -> _Cells:
+    """Rectangles cut evenly into cells, and crowns, whose centres lie in the square; neighbours
+    on the ground follow each other.
+    """
+    patches, crowns = geometry.patches, geometry.crowns
+    pieces = np.maximum(np.ceil(patches.lengths / most_m).astype(np.int64), 1)
+    number = pieces.prod(axis=1)
+    patch = np.repeat(np.arange(len(patches)), number)
+    index = np.arange(len(patch)) - np.repeat(np.cumsum(number) - number, number)
+    sizes = (patches.lengths / pieces)[patch]
+    corners = np.stack([index % pieces[patch, 0], index // pieces[patch, 0]], axis=1) * sizes
+    area = sizes[:, 0] * sizes[:, 1]
+    value = patches.exposures * RICHNESS[patches.materials]
+    centres = np.concatenate([on_patches(patches, patch, corners + 0.5 * sizes), crowns.centres])
+    nothing = np.zeros((len(crowns), 2))
+    leafy = leaf_area(crowns)
+    cells = _Cells(
+        np.concatenate([patch, -1 - np.arange(len(crowns))]),
+        np.concatenate([corners, nothing]),
+        np.concatenate([sizes, nothing]),
+        np.concatenate([area, leafy]),
+        np.concatenate([area * value[patch], leafy * crowns.exposures]),
+    )
+    off_centre = np.abs(centres[:, :2]).max(axis=1)
+    inside = off_centre <= max(half_m, float(off_centre.min()))  # one cell at least
+    squares = np.floor(centres[:, :2] / _SORT_M).astype(np.int64)
+    order = np.lexsort([squares[:, 1], squares[:, 0]])
+    return cells.take(order[inside[order]])
+
+
+def _sample(
+    rng: np.random.Generator,
+    geometry: Geometry,
+    cells: _Cells,
+    counts: Ids,
+    density: CityDensity,
+) -> list[Chunk]:
+    """Splats spread evenly over their cells: some that cover it, smaller ones of all sizes."""
+    cell = np.repeat(np.arange(len(counts)), counts)
+    apart = np.sqrt(cells.areas / np.maximum(counts, 1))[cell]
+    covering = rng.random(len(cell)) < OPAQUE_SHARE
+    tail = 1.0 / np.maximum(rng.random(len(cell)), 1e-9)
+    detail = density.detail * np.minimum(_power(tail, density.tail), _COARSEST)
+    spread = apart * np.where(covering, density.base, detail)
+    opacities = np.where(covering, opaque(rng, len(cell)), translucent(rng, len(cell)))
+    leafy = cells.patch[cell] < 0
+    flat, grown = np.flatnonzero(~leafy), np.flatnonzero(leafy)
+    fractions = rng.random((len(flat), 2))
+    place = cells.corners[cell[flat]] + fractions * cells.sizes[cell[flat]]
+    surface = surface_splats(
+        rng,
+        geometry.patches,
+        cells.patch[cell[flat]],
+        (place[:, 0], place[:, 1]),
+        spread[flat],
+        opacities[flat],
+        _PLAIN,
+    )
+    ids = -1 - cells.patch[cell[grown]]
+    return [surface, _leaves(rng, geometry.crowns, ids, spread[grown], opacities[grown])]
+
+
+def _leaves(
+    rng: np.random.Generator, crowns: Crowns, ids: Ids, spread: Float64, opacities: Float64
+) -> Chunk:
+    inside = near_normal(rng, (len(ids), 3)).astype(np.float64)
+    x, y, z = inside.T
+    deep = rng.random(len(ids))
+    inside *= ((1.0 - 0.5 * deep * deep) / np.sqrt(x * x + y * y + z * z + 1e-12))[:, None]
+    return leaf_splats(rng, crowns, ids, inside, spread, opacities)
+
+
+def _power(base: Float64, exponent: float) -> Float64:
+    """base ** exponent from square roots, whose bits are the same everywhere: the exponent is
+    rounded to sixteenths.
+    """
+    result, root = np.ones_like(base), base
+    sixteenths = round(16 * exponent)
+    for bit in (8, 4, 2, 1):
+        root = np.sqrt(root)
+        if sixteenths & bit:
+            result *= root
+    return result
