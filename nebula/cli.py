@@ -7,18 +7,39 @@ options object of ``nebula.options`` to ``run`` of the module of its own name, w
 
 from __future__ import annotations
 
-import math
 import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn
 
 import click
 
 from gaussians.errors import InputError
+from nebula.cli_options import (
+    COUNT,
+    METHODS,
+    NOT_NEGATIVE,
+    POSITIVE,
+    SEARCH_METHODS,
+    Finite,
+    accelerator_option,
+    baseline_option,
+    display_options,
+    json_option,
+    method_option,
+    out_option,
+    scene_options,
+    seed_option,
+    tau_option,
+    threads_option,
+    trace_option,
+    trace_options,
+    view_option,
+    view_options,
+)
 from nebula.figures import FIGURES
 from nebula.output import STDOUT, CommandResult, check_json_target, write_json
 
@@ -32,121 +53,6 @@ EPILOG = (
     "Exit status: 0 success; 2 something given is wrong or cannot be read or written; 1 a fault of "
     "the program; 130 interrupted. NEBULA_TRACEBACK=1 shows where an error came from."
 )
-
-Function = TypeVar("Function", bound=Callable[..., Any])
-
-
-class _Finite(click.FloatRange):
-    """A finite number in a range; click alone lets nan pass."""
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> float:
-        number = float(super().convert(value, param, ctx))
-        if not math.isfinite(number):
-            self.fail(f"{value} is not a finite number", param, ctx)
-        return number
-
-
-POSITIVE = _Finite(min=0, min_open=True)
-NOT_NEGATIVE = _Finite(min=0)
-COUNT = click.IntRange(min=1)
-LEAVES = click.IntRange(1_000, 20_000_000)
-PIXELS = click.IntRange(1, 16_384)
-FOV_DEG = _Finite(min=1, max=170)
-METHODS = click.Choice(["exact", "paper", "independent"])
-SEARCH_METHODS = click.Choice(
-    [
-        *("flat", "depth_first", "streaming", "temporal", "validity", "wheel", "auto"),
-        *("octree_gs", "city_gaussian"),
-    ]
-)
-UP_AXES = click.Choice(["+x", "-x", "+y", "-y", "+z", "-z"])
-
-
-def _options(*options: Callable[[Function], Function]) -> Callable[[Function], Function]:
-    """One decorator from several, in the order of the help text."""
-
-    def decorate(function: Function) -> Function:
-        for option in reversed(options):
-            function = option(function)
-        return function
-
-    return decorate
-
-
-scene_options = _options(
-    click.option(
-        "--scene", metavar="PATH", help="PLY, SPZ, .splat, SOG, lod-meta, layout; else a city."
-    ),
-    click.option("--config", metavar="NAME|FILE", help="Scene and placement from configs/scenes/."),
-    click.option("--city-leaves", "--city", type=LEAVES, help="Generated city.  [default: 300000]"),
-    click.option("--level", type=click.IntRange(min=0), help="Level of a scene; 0 is the finest."),
-    click.option("--up", type=UP_AXES, help="Up axis.  [default: -y for files, +z for the city]"),
-    click.option("--units-per-metre", type=POSITIVE, help="Scene units per metre.  [default: 1]"),
-)
-seed_option = click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
-view_option = click.option(
-    "--view", metavar="EX,EY,EZ:LX,LY,LZ", help="Eye and look-at, scene units."
-)
-display_options = _options(
-    click.option("--fov", "fov_deg", type=FOV_DEG, help="Horizontal, degrees.  [default: 96]"),
-    click.option("--width", type=PIXELS, help="Pixels per eye.  [default: 1024]"),
-    click.option("--height", type=PIXELS, help="Pixels per eye.  [default: 1024]"),
-    click.option("--display", metavar="NAME", help="prototype or quest3, instead of the three."),
-)
-view_options = _options(
-    view_option,
-    click.option("--near", "near_m", type=POSITIVE, help="Near plane, m.  [default: 0.2]"),
-    display_options,
-)
-baseline_option = click.option(
-    "--baseline",
-    "baseline_m",
-    type=NOT_NEGATIVE,
-    default=0.06,
-    show_default=True,
-    help="Between the eyes, m.",
-)
-trace_option = click.option(
-    "--trace",
-    metavar="NAME|CSV",
-    help="stand, walk, flight, teleport or an EyeNavGS recording.  [default: walk]",
-)
-tau_option = click.option(
-    "--tau", "tau_px", type=NOT_NEGATIVE, default=6.0, show_default=True, help="LoD, px."
-)
-trace_options = _options(
-    trace_option,
-    click.option("--frames", type=COUNT, default=12, show_default=True),
-    click.option("--search-every", type=COUNT, default=4, show_default=True, help="Frames."),
-    tau_option,
-)
-method_option = click.option("--method", type=METHODS, default="exact", show_default=True)
-accelerator_option = click.option(
-    "--accelerator",
-    metavar="NAME|FILE",
-    default="nebula",
-    show_default=True,
-    help="Or gscore_nebula.",
-)
-threads_option = click.option(
-    "--threads", type=click.IntRange(1, 1024), help="CPU threads.  [default: all cores]"
-)
-json_option = click.option(
-    "--json", "json_target", metavar="FILE", help="Write the result as JSON; - is standard output."
-)
-
-
-def out_option(default: str | None) -> Callable[[Function], Function]:
-    """``--out DIR``; without a default it must be given."""
-    given: dict[str, Any] = {"required": True} if default is None else {"default": default}
-    return click.option(
-        "--out",
-        type=click.Path(path_type=Path),
-        show_default=True,
-        metavar="DIR",
-        help="Files of the same name are replaced, others stay.",
-        **given,
-    )
 
 
 @click.group(
@@ -308,7 +214,7 @@ def convert(source: str, up: str | None, json_target: str | None, **values: Any)
 )
 @click.option(
     "--fan-out-ratio",
-    type=_Finite(min=0, max=1, min_open=True),
+    type=Finite(min=0, max=1, min_open=True),
     default=1.0,
     show_default=True,
     help="Leave out nodes above this share of their parent's size, such as 0.7.",
@@ -347,7 +253,7 @@ def build_tree(
 @click.option("--compare", is_flag=True, help="All methods and baseline rules, one after another.")
 @click.option(
     "--hysteresis",
-    type=_Finite(min=0, max=0.05),
+    type=Finite(min=0, max=0.05),
     default=0.0,
     show_default=True,
     help="Share of its switching distance by which a node stays refined.",
