@@ -49,7 +49,6 @@ Float32 = NDArray[np.float32]
 
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _MINUS_HALF = np.float32(-0.5)
-BLOCK = 4
 _INFINITY = np.float32(np.inf)
 _BLOCK = 4  # pixels; a block has WIDTH of them
 _AHEAD = 16  # list entries whose scattered records are asked for in advance
