@@ -44,6 +44,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         x, y, z = walk.pose(frame).position
         request = SearchRequest((x, y, z), DISPLAYS["prototype"].fx, options.tau)
         received = client.receive(cloud.search(request, frame))
+        cloud.receive(client.report())
         drawn = len(client.select(request).node_ids)
         sent += received.message_bytes if frame else 0  # the first one is the start-up
         new, held = received.payloads, received.held

@@ -1,5 +1,5 @@
-"""The client end of one session: applies messages, and selects what to draw. No sockets, no
-rendering.
+"""The client end of one session: applies messages, says how far it is, and selects what to draw.
+No sockets, no clock, no rendering.
 """
 
 from __future__ import annotations
@@ -8,30 +8,49 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gaussians.errors import InputError
 from gaussians.scene import Scene
-from lod_cloud.codec import PaperCodec
 from lod_cloud.criterion import SearchRequest
-from lod_cloud.cut import difference
-from lod_cloud.delta_cut import DeltaCut, ManagementTable
+from lod_cloud.delta_cut import DeltaCut, Probe, Report
+from lod_cloud.events import Events
 from lod_cloud.lod_tree import Int32
+from lod_cloud.management_table import ManagementTable, TableChange
 from lod_cloud.node_records import NodeRecords
-from lod_cloud.protocol import DELTA_CUT, SESSION_START, RemoteProtocolError, unseal
+from lod_cloud.outcome import outcome
+from lod_cloud.protocol import (
+    DELTA_CUT,
+    PROBE,
+    REPORT,
+    SESSION_START,
+    LocalProtocolError,
+    RemoteProtocolError,
+    seal,
+    unseal,
+)
 from lod_cloud.session import SessionStart
 from lod_cloud.subgraph import LocalSubgraph
+
+EARLY_MESSAGES = 64  # kept until what they follow arrives
+
+_Applied = tuple[TableChange, int, int]  # what changed, payloads, nodes that left the cut
 
 
 @dataclass(frozen=True)
 class ReceiveStats:
-    """One message, counted. A session start brings no nodes and has search index and frame -1."""
+    """What one message brought about: the changes of that message and of earlier arrivals that
+    had to wait for it, or none.
+    """
 
-    search_index: int
-    frame: int
+    search_index: int  # of the newest change applied, -1 before the first
+    frame: int  # likewise
     message_bytes: int
+    applied: int  # changes
     payloads: int
     reactivated: int
     removed: int
     evicted: int
     held: int
+    refused: int  # earlier arrivals that led nowhere; `Client.report` asks for them
 
 
 @dataclass(frozen=True)
@@ -52,38 +71,64 @@ class Selection:
 class Client:
     """Holds exactly what the cloud's messages made it hold.
 
-    A message that is damaged, out of order, or leads to another state than the cloud's raises
-    RemoteProtocolError and changes nothing.
+    Messages may come damaged, twice, in any order, or not at all: what is early waits, what is
+    known already is passed over, and `report` tells the cloud what is missing. A message that is
+    damaged or leads to another state than the cloud's raises RemoteProtocolError and changes
+    nothing but that report.
     """
 
     def __init__(self) -> None:
         self.table: ManagementTable | None = None
         self.frame = -1  # of the newest search applied
-        self._codec: PaperCodec | None = None
+        self.applied = 0  # sequence number of the newest change applied
+        self._start: SessionStart | None = None
         self._subgraph = LocalSubgraph(0)
         self._newest: Selection | None = None
-        self._nodes = 0
+        self._early: dict[int, DeltaCut] = {}  # by sequence number
+        self._connection = 0
+        self._seen = 0
+        self._damaged = False  # something unreadable came since the last change
+        self._strayed = 0  # messages since the last change that led to a state not the cloud's
 
     def receive(self, message: bytes) -> ReceiveStats:
-        """Apply the next message of the session."""
-        kind, body = unseal(message)
-        if kind == SESSION_START:
-            return self._start(body, len(message))
-        if kind == DELTA_CUT:
-            return self._apply(DeltaCut.from_bytes(body), len(message))
-        raise RemoteProtocolError(
-            f"message kind must be {SESSION_START} or {DELTA_CUT}, not {kind}"
+        """Take in a message of the cloud."""
+        try:
+            return self._receive(message)
+        except RemoteProtocolError:
+            self._damaged = True
+            raise
+
+    def report(self) -> bytes:
+        """The message that tells the cloud how far this client is; one per message received or
+        per pose sent, whichever is less. Raises LocalProtocolError before the session start.
+        """
+        if self._start is None or self.table is None:
+            raise LocalProtocolError("the session start must arrive before anything is reported")
+        report = Report(
+            session=self._start.session,
+            connection=self._connection,
+            applied=self.applied,
+            state_hash=self.table.state_hash,
+            seen=self._seen,
+            missing=self._damaged or self._seen > self.applied,
+            start_over=self._strayed > 1,
         )
+        return seal(REPORT, report.to_bytes())
+
+    def reconnect(self) -> bytes:
+        """The first message over a new connection: everything underway on the old one is lost."""
+        self._connection += 1
+        return self.report()
 
     def select(self, request: SearchRequest) -> Selection:
         """The finest complete set at ``request``'s position; see `LocalSubgraph.choose`.
 
         The same set as last time comes with the same Scene, not copied again. Raises
-        RemoteProtocolError before the first search result.
+        LocalProtocolError before the first search result.
         """
         if self.table is None or len(self.table) == 0:
-            raise RemoteProtocolError("nothing to draw: the first search result must arrive first")
-        choice = self._subgraph.choose(self.table.in_cut, request)
+            raise LocalProtocolError("nothing to draw: the first search result must arrive first")
+        choice = self._subgraph.choose(self.table.in_cut(self._subgraph.ids), request)
         node_ids = self._subgraph.ids[choice.rows]
         if self._newest is not None and np.array_equal(node_ids, self._newest.node_ids):
             node_ids, scene = self._newest.node_ids, self._newest.scene
@@ -99,60 +144,130 @@ class Client:
         )
         return self._newest
 
-    def _start(self, body: bytes, size: int) -> ReceiveStats:
-        if self.table is not None:
-            raise RemoteProtocolError("session start must come once, as the first message")
-        start = SessionStart.from_bytes(body)
-        self._codec, self._nodes = start.codec, start.nodes
-        self._subgraph = LocalSubgraph(start.codec.sh_degree)
-        self.table = ManagementTable.empty(start.frames_per_search, start.reuse_window_frames)
-        return ReceiveStats(-1, -1, size, 0, 0, 0, 0, 0)
-
-    def _apply(self, delta: DeltaCut, size: int) -> ReceiveStats:
-        if self.table is None or self._codec is None:
+    def _receive(self, message: bytes) -> ReceiveStats:
+        kind, body = unseal(message)
+        if kind == SESSION_START:
+            self._begin(SessionStart.from_bytes(body))
+            return self._stats(len(message), [])
+        if kind not in (DELTA_CUT, PROBE):
+            raise RemoteProtocolError(
+                f"message kind must be {SESSION_START}, {DELTA_CUT} or {PROBE}, not {kind}"
+            )
+        if self._start is None:
             raise RemoteProtocolError("session start must come before any search result")
-        expected = self.table.search_index + 1
-        if delta.search_index != expected:
-            raise RemoteProtocolError(f"search index must be {expected}, not {delta.search_index}")
+        news = DeltaCut.from_bytes(body) if kind == DELTA_CUT else Probe.from_bytes(body)
+        if news.session != self._start.session:
+            raise RemoteProtocolError(f"session must be {self._start.session}, not {news.session}")
+        self._seen = max(self._seen, news.sequence)
+        if isinstance(news, Probe) or news.sequence <= self.applied:
+            return self._stats(len(message), [])
+        if news.base > self.applied:
+            if len(self._early) < EARLY_MESSAGES:
+                self._early[news.sequence] = news
+            return self._stats(len(message), [])
+        first = self._apply(news)
+        others, refused = self._apply_early()
+        return self._stats(len(message), [first, *others], refused)
+
+    def _begin(self, start: SessionStart) -> None:
+        """Enter a session; the one already entered goes on undisturbed."""
+        if self._start is not None and start.session == self._start.session:
+            if start.to_bytes() != self._start.to_bytes():
+                raise RemoteProtocolError(f"session {start.session} must not start in two ways")
+            return
+        table = ManagementTable(start.nodes, start.frames_per_search, start.reuse_window_frames)
+        self._start, self.table = start, table
+        self._subgraph, self._newest = LocalSubgraph(start.codec.sh_degree), None
+        self._early = {}
+        self.frame, self.applied, self._seen, self._connection = -1, 0, 0, 0
+        self._damaged, self._strayed = False, 0
+
+    def _apply_early(self) -> tuple[list[_Applied], int]:
+        """Apply what was waiting for the newest change; also the number that led nowhere."""
+        done: list[_Applied] = []
+        refused = 0
+        for sequence in sorted(self._early):
+            delta = self._early[sequence]
+            if sequence > self.applied and delta.base > self.applied:
+                continue
+            del self._early[sequence]
+            if sequence > self.applied:
+                try:
+                    done.append(self._apply(delta))
+                except RemoteProtocolError:
+                    self._damaged = True
+                    refused += 1
+        return done, refused
+
+    def _apply(self, delta: DeltaCut) -> _Applied:
+        assert self._start is not None and self.table is not None
+        codec = self._start.codec
         if delta.frame <= self.frame:
             raise RemoteProtocolError(f"frame must be above {self.frame}, not {delta.frame}")
-        if delta.codec_hash != self._codec.version:
+        if delta.codec_hash != codec.version:
             raise RemoteProtocolError(
-                f"codebook version must be {self._codec.version:#x}, not {delta.codec_hash:#x}"
+                f"codebook version must be {codec.version:#x}, not {delta.codec_hash:#x}"
             )
-        arrived = self._codec.decode(delta.payload)
-        if len(arrived) and arrived.ids[-1] >= self._nodes:
-            raise RemoteProtocolError(f"node ids must be below {self._nodes}")
-        evicted = self._apply_nodes(self.table, delta, arrived)
-        return ReceiveStats(
-            delta.search_index,
-            delta.frame,
-            size,
-            len(arrived),
-            len(delta.reactivated),
-            len(delta.removed),
-            evicted,
-            len(self.table),
-        )
-
-    def _apply_nodes(self, before: ManagementTable, delta: DeltaCut, arrived: NodeRecords) -> int:
-        """Move table and subgraph on; number of evicted nodes."""
-        if len(difference(arrived.ids, delta.reactivated)) != len(arrived):
-            raise RemoteProtocolError("no node may be both sent and re-activated")
-        added = np.sort(np.concatenate([arrived.ids, delta.reactivated]))
-        try:
-            table, change = before.updated(delta.search_index, added, delta.removed)
-        except ValueError as error:
-            raise RemoteProtocolError(str(error)) from error
-        if table.state_hash != delta.state_hash:
-            raise RemoteProtocolError(
-                f"search {delta.search_index}: state hash must be {delta.state_hash:#018x}, "
-                f"not {table.state_hash:#018x}"
-            )
-        if not np.array_equal(change.needed, arrived.ids):
+        table = self.table if delta.base else self.table.emptied()
+        self._strayed += 1  # until it is known to be right
+        if delta.events is None:
+            arrived = codec.decode(delta.payload)
+            entered, left = np.sort(np.concatenate([arrived.ids, delta.reactivated])), delta.removed
+        else:
+            entered, left, arrived = self._from_events(delta.events, delta.payload)
+        change = _prepared(table, delta, entered, left, arrived)
+        fresh = np.isin(arrived.ids, change.needed, assume_unique=True)
+        if delta.base == delta.sequence - 1 and not fresh.all():
             raise RemoteProtocolError(
                 f"search {delta.search_index}: must bring exactly what is new"
             )
-        self._subgraph.apply(change, arrived)
-        self.table, self.frame = table, delta.frame
-        return len(change.evicted)
+        self._strayed = 0
+        if delta.base == 0:
+            self._subgraph = LocalSubgraph(codec.sh_degree)
+        self._subgraph.apply(change, arrived if fresh.all() else arrived.take(fresh))
+        table.commit(change)
+        self.table, self.frame, self.applied = table, delta.frame, delta.sequence
+        self._damaged = False
+        return change, len(arrived), len(left)
+
+    def _from_events(self, events: Events, payload: bytes) -> tuple[Int32, Int32, NodeRecords]:
+        """Nodes that entered and left the cut, and what came for them."""
+        assert self._start is not None and self.table is not None
+        table, graph = self.table, self._subgraph
+        found = outcome(events, table, graph)
+        places = found.needed, found.needed_parents
+        return found.entered, found.left, self._start.codec.decode(payload, places)
+
+    def _stats(self, size: int, applied: list[_Applied], refused: int = 0) -> ReceiveStats:
+        assert self.table is not None
+        return ReceiveStats(
+            search_index=self.table.search_index,
+            frame=self.frame,
+            message_bytes=size,
+            applied=len(applied),
+            payloads=sum(payloads for _, payloads, _ in applied),
+            reactivated=sum(change.reactivated for change, _, _ in applied),
+            removed=sum(left for _, _, left in applied),
+            evicted=sum(len(change.evicted) for change, _, _ in applied),
+            held=len(self.table),
+            refused=refused,
+        )
+
+
+def _prepared(
+    table: ManagementTable, delta: DeltaCut, entered: Int32, left: Int32, arrived: NodeRecords
+) -> TableChange:
+    """The change that ``delta`` asks for, proved to lead to the cloud's state."""
+    index = delta.search_index
+    try:
+        change = table.prepare(index, entered, left, delta.dropped)
+    except InputError as error:
+        raise RemoteProtocolError(str(error)) from error
+    if change.state_hash != delta.state_hash:
+        raise RemoteProtocolError(
+            f"search {index}: state hash must be {delta.state_hash:#018x}, "
+            f"not {change.state_hash:#018x}"
+        )
+    if not np.isin(change.needed, arrived.ids, assume_unique=True).all():
+        raise RemoteProtocolError(f"search {index}: must bring every node that is new")
+    return change

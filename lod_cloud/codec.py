@@ -158,10 +158,15 @@ class PaperCodec:
         return self.codebook.encode(_harmonics(tree.gaussians, ids))
 
     def encode(
-        self, nodes: NodeRecords, words: UInt16, words_valid: NDArray[np.bool_]
+        self,
+        nodes: NodeRecords,
+        words: UInt16,
+        words_valid: NDArray[np.bool_],
+        *,
+        places: bool = True,
     ) -> tuple[bytes, int]:
         """Payload of these nodes with their words (see `assign_words`); bytes and number of
-        escapes.
+        escapes. Without ``places`` ids and parents are left out: the client knows them.
         """
         scene = nodes.gaussians
         tile, offset, valid = self.position.encode(scene.means)
@@ -177,8 +182,9 @@ class PaperCodec:
         inner = valid & (nodes.child_counts > 0)
         writer = ColumnWriter()
         writer.raw(_COUNTS.pack(len(nodes), len(escaped)))
-        writer.differences(nodes.ids)
-        writer.differences(nodes.parents)
+        if places:
+            writer.differences(nodes.ids)
+            writer.differences(nodes.parents)
         writer.plain(nodes.child_counts.astype(np.uint16))
         writer.differences(escaped)
         writer.differences(tile[valid])
@@ -192,12 +198,20 @@ class PaperCodec:
         writer.plain(nodes.float32_rows(escaped))
         return writer.bytes(), len(escaped)
 
-    def decode(self, payload: bytes) -> NodeRecords:
-        """Inverse of `encode`. Raises RemoteProtocolError for anything it would not write."""
+    def decode(self, payload: bytes, places: tuple[Int32, Int32] | None = None) -> NodeRecords:
+        """Inverse of `encode`, given ids and parents where these were left out.
+
+        Raises RemoteProtocolError for anything it would not write.
+        """
         reader = ColumnReader(payload)
         count, escapes = _COUNTS.unpack(reader.raw(_COUNTS.size))
-        ids = reader.differences(np.int32, count)
-        parents = reader.differences(np.int32, count)
+        if places is None:
+            ids = reader.differences(np.int32, count)
+            parents = reader.differences(np.int32, count)
+        else:
+            ids, parents = places
+            if len(ids) != count:
+                raise RemoteProtocolError(f"payload must have {len(ids)} nodes, not {count}")
         child_counts = reader.plain(np.uint16, count).astype(np.int32)
         escaped = reader.differences(np.int32, escapes)
         _check_escapes(escaped, count)

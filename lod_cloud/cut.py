@@ -52,3 +52,22 @@ def difference(ids: Int32, other: Int32) -> Int32:
 def overlap(before: Cut, after: Cut) -> float:
     """Share of ``after`` that was already in ``before`` (Fig. 7); 1 for equal cuts."""
     return 1.0 - len(difference(after.node_ids, before.node_ids)) / len(after)
+
+
+def without(ids: Int32, others: Int32) -> Int32:
+    """As `difference`, at a cost that depends on how many the members are, not on their numbers:
+    for changes rather than cuts.
+    """
+    return ids[~np.isin(ids, others, assume_unique=True)]
+
+
+def compose(first: tuple[Int32, Int32], second: tuple[Int32, Int32]) -> tuple[Int32, Int32]:
+    """Members added and removed by two changes of a set, one after the other, as one change.
+
+    Each change is (added, removed), without duplicates; so is the result, ascending.
+    """
+    (added, removed), (added_then, removed_then) = first, second
+    return (
+        np.union1d(without(added, removed_then), without(added_then, removed)),
+        np.union1d(without(removed, added_then), without(removed_then, added)),
+    )

@@ -36,6 +36,17 @@ class NodeRecords:
         radius, extent = tree.radius[ids] * inner, tree.extent[ids] * inner
         return cls(ids, tree.parent[ids], counts, radius, extent, tree.gaussians.take(ids))
 
+    def take(self, rows: NDArray[np.bool_]) -> NodeRecords:
+        """Only the marked rows."""
+        return NodeRecords(
+            self.ids[rows],
+            self.parents[rows],
+            self.child_counts[rows],
+            self.radius[rows],
+            self.extent[rows],
+            self.gaussians.take(np.flatnonzero(rows)),
+        )
+
     def check(self) -> NodeRecords:
         """Return self, or raise RemoteProtocolError unless ids and parents are those of a tree."""
         ids, parents = self.ids.astype(np.int64), self.parents.astype(np.int64)

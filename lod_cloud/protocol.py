@@ -14,16 +14,22 @@ import zstandard
 from gaussians.errors import InputError
 
 MAGIC = b"NBLA"
-VERSION = 1
+VERSION = 2
 SESSION_START = 1
 DELTA_CUT = 2
-_ENVELOPE = struct.Struct("<4sBBxxQQ8s")  # magic, version, kind, body bytes, packed bytes, checksum
+PROBE = 3
+REPORT = 4
+_ENVELOPE = struct.Struct("<4sBBQQ8s")  # magic, version, kind, body bytes, packed bytes, checksum
 _ZSTD_LEVEL = 3  # level 19 gains 1 to 2 % on these messages
 _BODY_LIMIT = 1 << 34
 
 
 class RemoteProtocolError(InputError):
     """The other side broke a rule, or the line damaged a message."""
+
+
+class LocalProtocolError(InputError):
+    """This side asked an endpoint for something that the state of the session does not allow."""
 
 
 def seal(kind: int, body: bytes) -> bytes:

@@ -15,6 +15,7 @@ from lod_cloud.protocol import RemoteProtocolError
 class SessionStart:
     """Parameters of the management tables, and the codec with its codebook."""
 
+    session: int
     nodes: int
     frames_per_search: int
     reuse_window_frames: int
@@ -23,6 +24,7 @@ class SessionStart:
     def to_bytes(self) -> bytes:
         """Body of a message."""
         fields = {
+            "session": self.session,
             "nodes": self.nodes,
             "frames_per_search": self.frames_per_search,
             "reuse_window_frames": self.reuse_window_frames,

@@ -8,6 +8,7 @@ everything else.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -16,8 +17,8 @@ from numpy.typing import NDArray
 from gaussians.parallel import run_chunks
 from gaussians.scene import FIELDS, Scene
 from lod_cloud.criterion import SearchRequest, refines
-from lod_cloud.delta_cut import TableChange
 from lod_cloud.lod_tree import Float32, Int32
+from lod_cloud.management_table import TableChange
 from lod_cloud.node_records import NodeRecords
 
 _SPARE = 1.25  # slots are allocated this much ahead
@@ -57,16 +58,36 @@ class LocalSubgraph:
 
     def apply(self, change: TableChange, arrived: NodeRecords) -> None:
         """Drop the evicted rows and insert ``arrived``, whose ids are ``change.needed``."""
+        kept = np.ones(len(self.ids), np.bool_)
+        kept[np.searchsorted(self.ids, change.evicted)] = False
+        positions = np.searchsorted(self.ids[kept], arrived.ids)
+
+        def spliced(rows: NDArray[Any], fresh: NDArray[Any]) -> NDArray[Any]:
+            left = rows if len(change.evicted) == 0 else rows[kept]
+            return np.insert(left, positions, fresh, axis=0) if len(fresh) else left
+
         spheres = np.column_stack([arrived.gaussians.means, arrived.radius, arrived.extent])
-        slots = self._allocate(self._slots[~change.kept], len(arrived))
-        self.ids = change.splice(self.ids, arrived.ids)
-        self._parents = change.splice(self._parents, arrived.parents)
-        self._child_counts = change.splice(self._child_counts, arrived.child_counts)
-        self._slots = change.splice(self._slots, slots)
-        self._spheres = change.splice(self._spheres, spheres)
+        slots = self._allocate(self._slots[~kept], len(arrived))
+        self.ids = spliced(self.ids, arrived.ids)
+        self._parents = spliced(self._parents, arrived.parents)
+        self._child_counts = spliced(self._child_counts, arrived.child_counts)
+        self._slots = spliced(self._slots, slots)
+        self._spheres = spliced(self._spheres, spheres)
         for store, name in zip(self._store, FIELDS, strict=True):
             store[slots] = getattr(arrived.gaussians, name)
-        self._first_child, self._complete = _link(self.ids, self._parents, self._child_counts)
+        if len(change.evicted) or len(arrived):
+            self._first_child, self._complete = _link(self.ids, self._parents, self._child_counts)
+
+    def child_counts(self, ids: Int32) -> Int32:
+        """Number of children of nodes held."""
+        return self._child_counts[np.searchsorted(self.ids, ids)]
+
+    def children(self, ids: Int32) -> Int32:
+        """All nodes held whose parent is one of ``ids`` (ascending, held or not)."""
+        begins = np.searchsorted(self._parents, ids)
+        counts = np.searchsorted(self._parents, ids, side="right") - begins
+        offsets = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+        return self.ids[np.repeat(begins, counts) + offsets]
 
     def choose(self, in_cut: NDArray[np.bool_], request: SearchRequest) -> Choice:
         """The finest complete set from ``request``'s position, starting from the cut (rows marked).

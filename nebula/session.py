@@ -2,7 +2,8 @@
 
 Frame i is shown at i / rate seconds. Every w frames the client sends its pose; the answer arrives
 one uplink latency, the cloud's computing time, the transmission and one downlink latency later,
-and is applied at the first frame after that. Until then the client goes on with what it holds.
+and is applied at the first frame after that. Until then the client goes on with what it holds. With
+each pose the client says how far it is.
 The first cut is delivered before frame 0: its time is the start-up time, not part of the trace.
 """
 
@@ -123,6 +124,7 @@ class Session:
         return pose_s + 1e-3 * (self._link.latency_ms + self._config.cloud.compute_ms)
 
     def _search(self, request: SearchRequest, frame: int) -> bytes:
+        self.cloud.receive(self.client.report())
         begin = time.perf_counter()
         cut = flat_search(self.cloud.tree, request)
         self.search_ms.append(1e3 * (time.perf_counter() - begin))

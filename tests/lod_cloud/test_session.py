@@ -18,7 +18,7 @@ from lod_cloud.criterion import SearchRequest
 from lod_cloud.cut import is_complete
 from lod_cloud.lod_tree import LodTree
 from lod_cloud.node_records import NodeRecords
-from lod_cloud.protocol import RemoteProtocolError, seal
+from lod_cloud.protocol import LocalProtocolError, RemoteProtocolError, seal
 from lod_cloud.search import flat_search
 from tests.lod_cloud.trees import random_tree, requests, walk
 from tests.naive import search as naive
@@ -185,59 +185,77 @@ def test_an_unchanged_selection_is_not_copied_again() -> None:
     assert again.scene is first.scene
 
 
-def test_order_is_enforced_and_refusals_change_nothing() -> None:
+def test_damage_changes_nothing_and_order_is_restored() -> None:
     tree = random_tree(200, 2)
     cloud, client, _ = pair(tree)
-    path = walk(3, 4, teleports=True)
+    path = walk(3, 5, teleports=True)
     messages = [cloud.search(request, 4 * i) for i, request in enumerate(path)]
     early = Client()
     with pytest.raises(RemoteProtocolError, match="session start must come before"):
         early.receive(messages[0])
-    with pytest.raises(RemoteProtocolError, match="first search result must arrive"):
+    with pytest.raises(LocalProtocolError, match="session start must arrive before"):
+        early.report()
+    with pytest.raises(LocalProtocolError, match="first search result must arrive"):
         client.select(path[0])
-    with pytest.raises(RemoteProtocolError, match="search index must be 0, not 1"):
-        client.receive(messages[1])
-    client.receive(messages[0])
-    with pytest.raises(RemoteProtocolError, match="search index must be 1, not 0"):
-        client.receive(messages[0])
-    before = client.table
-    damaged = bytearray(messages[1])
+    assert client.receive(messages[1]).applied == 0
+    assert client.receive(messages[0]).applied == 2
+    assert client.receive(messages[0]).applied == 0
+    assert client.table is not None
+    before, state = client.table.search_index, client.table.state_hash
+    damaged = bytearray(messages[2])
     damaged[-1] ^= 1
-    for bad in (bytes(damaged), messages[1][:-3], b"", messages[2]):
+    for bad in (bytes(damaged), messages[2][:-3], b"", seal(9, b"")):
         with pytest.raises(RemoteProtocolError):
             client.receive(bad)
-    assert client.table is before
-    with pytest.raises(RemoteProtocolError, match="must come once"):
-        client.receive(cloud.session_start())
-    for message in messages[1:]:
-        client.receive(message)
+    assert (client.table.search_index, client.table.state_hash) == (before, state)
+    client.receive(cloud.session_start())  # a second copy of it
+    assert client.receive(messages[4]).applied == 0
+    assert client.receive(messages[3]).applied == 0
+    assert client.receive(messages[2]).applied == 3
     assert same_state(cloud, client)
-    with pytest.raises(RemoteProtocolError, match="kind must be"):
-        client.receive(seal(9, b""))
 
 
-def test_wrong_codebook_and_wrong_state_are_refused() -> None:
+def test_wrong_codebook_and_wrong_session_are_refused() -> None:
     tree = random_tree(200, 2)
     cloud, client, _ = pair(tree)
-    other = Cloud(tree, PaperCodec.train(tree, 99, words=32))
     request = SearchRequest((0, 0, 0), 300, 6)
+    other = Cloud(tree, PaperCodec.train(tree, 99, words=32))
     with pytest.raises(RemoteProtocolError, match="codebook version must be"):
         client.receive(other.search(request, 0))
+    with pytest.raises(RemoteProtocolError, match="session 0 must not start in two ways"):
+        client.receive(other.session_start())
+    stranger = Cloud(tree, cloud._encoder, session=7)
+    with pytest.raises(RemoteProtocolError, match="session must be 0, not 7"):
+        client.receive(stranger.search(request, 0))
     client.receive(cloud.search(request, 0))
-    cloud.search(SearchRequest((5, 0, 0), 300, 6), 4)  # lost
-    cloud.table = dataclasses.replace(cloud.table, search_index=0)  # and its number used again
-    with pytest.raises(RemoteProtocolError):
-        client.receive(cloud.search(SearchRequest((9, 0, 0), 300, 6), 8))
-    assert client.table is not None and client.table.search_index == 0
+    with pytest.raises(RemoteProtocolError, match="session must be 7, not 0"):
+        stranger.receive(client.report())
+    client.receive(stranger.session_start())  # the cloud was started anew
+    stranger.receive(client.report())
+    client.receive(stranger.search(request, 4))
+    stranger.receive(client.report())
+    assert stranger.stats is not None and stranger.stats.kind == "step"
+    client.receive(stranger.search(request, 8))
+    assert same_state(stranger, client)
 
 
-def test_a_wrong_state_hash_is_refused() -> None:
+def test_a_wrong_state_hash_is_refused_and_made_good() -> None:
     tree = random_tree(50, 2)
     cloud, client, _ = pair(tree)
     client.receive(cloud.search(SearchRequest((0, 0, 0), 300, 6), 0))
-    cloud.table = dataclasses.replace(cloud.table, state_hash=cloud.table.state_hash ^ 1)
-    with pytest.raises(RemoteProtocolError, match="search 1: state hash must be"):
-        client.receive(cloud.search(SearchRequest((1, 0, 0), 300, 6), 4))
+    cloud.receive(client.report())
+    assert client.table is not None
+    client.table.state_hash ^= 1  # the client's memory has failed
+    for step, text in enumerate(("step", "start")):
+        message = cloud.search(SearchRequest((step, 0, 0), 300, 6), 4 + 4 * step)
+        assert cloud.stats is not None and cloud.stats.kind == text
+        if step == 0:
+            with pytest.raises(RemoteProtocolError, match="search 1: state hash must be"):
+                client.receive(message)
+        else:
+            client.receive(message)
+        cloud.receive(client.report())
+    assert same_state(cloud, client)
 
 
 def test_frames_must_rise() -> None:
@@ -262,6 +280,7 @@ def test_client_memory_follows_what_is_held() -> None:
     most = 0
     for index, request in enumerate(walk(4, 60)):
         client.receive(cloud.search(request, 4 * index))
+        cloud.receive(client.report())
         most = max(most, len(cloud.table) + cloud.stats.payloads)  # type: ignore[union-attr]
     assert len(client._subgraph._store[0]) <= 1.3 * most
     assert len(client._subgraph._free) + len(client._subgraph) == len(client._subgraph._store[0])

@@ -1,0 +1,251 @@
+"""Two ends of a session and a line between them that does whatever a schedule says."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+from hypothesis import strategies as st
+
+from gaussians.scene import FIELDS, Scene
+from lod_cloud.client import Client
+from lod_cloud.cloud import Cloud
+from lod_cloud.codec import PaperCodec
+from lod_cloud.criterion import SearchRequest
+from lod_cloud.cut import Cut, difference
+from lod_cloud.lod_tree import Int32, LodTree
+from lod_cloud.protocol import RemoteProtocolError
+from lod_cloud.search import flat_search
+from lod_cloud.tree_encoder import TreeEncoder
+from tests.lod_cloud.trees import random_tree
+
+PLACES = 48  # along a walk; a step is short, a teleport is not
+
+Action = tuple[str, int]
+
+
+@dataclasses.dataclass(frozen=True)
+class World:
+    """One tree, how it is coded, and the cuts of a walk through it."""
+
+    tree: LodTree
+    encoder: TreeEncoder
+    decoded: Scene  # what a client must have for every node
+    cuts: list[Cut]
+
+
+@cache
+def world(leaves: int, seed: int, codebook: int = 1) -> World:
+    tree = random_tree(leaves, seed)
+    encoder = TreeEncoder(tree, PaperCodec.train(tree, codebook, words=8))
+    payload, _ = encoder.encode(np.arange(len(tree), dtype=np.int32))
+    decoded = encoder.codec.decode(payload).gaussians
+    places = [SearchRequest((0.7 * i - 16.0, 0.5, 0.0), 200, 6) for i in range(PLACES)]
+    return World(tree, encoder, decoded, [flat_search(tree, place) for place in places])
+
+
+class HostilePair:
+    """A cloud and a client, and what is underway between them. Compares both at every message."""
+
+    def __init__(
+        self, where: World, *, w: int, window: int, unacknowledged: tuple[int, int], whole: bool
+    ) -> None:
+        self.world = where
+        self.cloud = Cloud(
+            where.tree,
+            where.encoder,
+            frames_per_search=w,
+            reuse_window_frames=window,
+            unacknowledged=unacknowledged,
+        )
+        self.client = Client()
+        self.down = [self.cloud.session_start()]
+        self.up: list[bytes] = []
+        self.kinds: list[str] = []  # of messages sent
+        self._whole = whole  # cuts are given as they are, not as changes
+        self._place, self._frame = PLACES // 2, 0
+        self._found: Int32 = np.empty(0, np.int32)
+        nothing = np.empty(0, np.int32)
+        self._states = {0: (nothing, nothing, 0)}  # of the cloud's table, by sequence number
+
+    def act(self, action: Action) -> None:
+        """One event: a search, or something that happens to what is underway."""
+        kind, number = action
+        getattr(self, f"_{kind}")(number)
+
+    def heal(self, *, lose_what_is_underway: bool) -> None:
+        """From now on the line works: one round trip and one search make all good."""
+        if self.client.table is None:
+            self.down.append(self.cloud.session_start())  # the service repeats it until it arrives
+            self._deliver_all()
+        if lose_what_is_underway:
+            self.down.clear()
+            self.up.clear()
+        self._deliver_all()
+        self._walk(0)
+        self._deliver_all()
+        self._walk(0)
+        self._deliver_all()
+        assert self.client.applied == self.cloud.sequence
+        assert self.client.table is not None
+        assert np.array_equal(self.client.table.cut_ids, self._found)
+
+    def _deliver_all(self) -> None:
+        while self.down:
+            self._down(0)
+        while self.up:
+            self._up(0)
+
+    def _walk(self, step: int) -> None:
+        self._place = (self._place + step % 3 - 1) % PLACES
+        self._search()
+
+    def _teleport(self, place: int) -> None:
+        self._place = place % PLACES
+        self._search()
+
+    def _search(self) -> None:
+        cut = self.world.cuts[self._place]
+        self._frame += self.cloud.table.frames_per_search
+        if self._whole:
+            message = self.cloud.send(cut, self._frame)
+        else:
+            added = difference(cut.node_ids, self._found)
+            removed = difference(self._found, cut.node_ids)
+            change = SimpleNamespace(
+                added=added,
+                removed=removed,
+                cut_size=len(cut),
+                nodes_tested=0,
+                bytes_touched=0,
+            )
+            message = self.cloud.send_change(change, self._frame)
+        self._found = cut.node_ids
+        assert self.cloud.stats is not None
+        self.kinds.append(self.cloud.stats.kind)
+        table = self.cloud.table
+        self._states[self.cloud.sequence] = table.ids, table.last, table.state_hash
+        self.down.append(message)
+
+    def _down(self, which: int) -> None:
+        if self.down:
+            self._arrive(self.down.pop(which % len(self.down)), damaged=False)
+
+    def _up(self, which: int) -> None:
+        if self.up:
+            self.cloud.receive(self.up.pop(which % len(self.up)))
+
+    def _lose_down(self, which: int) -> None:
+        if self.down:
+            self.down.pop(which % len(self.down))
+
+    def _lose_up(self, which: int) -> None:
+        if self.up:
+            self.up.pop(which % len(self.up))
+
+    def _twice_down(self, which: int) -> None:
+        if self.down:
+            self.down.append(self.down[which % len(self.down)])
+
+    def _twice_up(self, which: int) -> None:
+        if self.up:
+            self.up.append(self.up[which % len(self.up)])
+
+    def _corrupt(self, bit: int) -> None:
+        if self.down:
+            damaged = bytearray(self.down.pop(0))
+            damaged[bit // 8 % len(damaged)] ^= 1 << bit % 8
+            self._arrive(bytes(damaged), damaged=True)
+
+    def _truncate(self, size: int) -> None:
+        if self.down:
+            message = self.down.pop(0)
+            self._arrive(message[: size % len(message)], damaged=True)
+
+    def _corrupt_up(self, bit: int) -> None:
+        if self.up:
+            damaged = bytearray(self.up.pop(0))
+            damaged[bit // 8 % len(damaged)] ^= 1 << bit % 8
+            try:
+                self.cloud.receive(bytes(damaged))
+            except RemoteProtocolError:
+                return
+            raise AssertionError("damage must be noticed")
+
+    def _disconnect(self, _: int) -> None:
+        self.down.clear()
+        self.up.clear()
+        if self.client.table is None:
+            self.down.append(self.cloud.session_start())
+        else:
+            self.up.append(self.client.reconnect())
+
+    def _arrive(self, message: bytes, *, damaged: bool) -> None:
+        """A message reaches the client, which then reports."""
+        before = self.client.applied
+        try:
+            self.client.receive(message)
+            assert not damaged
+        except RemoteProtocolError as error:
+            too_early = "session start must come before" in str(error)
+            assert damaged or too_early, error
+            assert self.client.applied == before
+        if self.client.table is not None:
+            self.up.append(self.client.report())
+            self.compare()
+
+    def compare(self) -> None:
+        """The client holds what the cloud's table held after the message it applied last."""
+        table, graph = self.client.table, self.client._subgraph
+        assert table is not None
+        ids, last, state_hash = self._states[self.client.applied]
+        assert np.array_equal(table.ids, ids)
+        assert np.array_equal(table.last, last)
+        assert table.state_hash == state_hash
+        assert len(table) == len(ids)
+        assert np.array_equal(graph.ids, ids)
+        assert np.array_equal(graph._parents, self.world.tree.parent[ids])
+        assert np.array_equal(graph._child_counts, self.world.tree.child_count[ids])
+        held, right = graph.gaussians(np.arange(len(ids), dtype=np.int32)), self.world.decoded
+        for name in FIELDS:
+            assert np.array_equal(getattr(held, name), getattr(right, name)[ids])
+
+
+FAULTS = (
+    "lose_down",
+    "lose_up",
+    "twice_down",
+    "twice_up",
+    "corrupt",
+    "corrupt_up",
+    "truncate",
+    "disconnect",
+    "down",  # anything that is underway, not the oldest
+    "up",
+)
+ARRIVE: list[Action] = [("down", 0), ("up", 0)]
+
+
+def schedules() -> st.SearchStrategy[list[Action]]:
+    """What happens, in order. A stall is a run of searches with nothing arriving; a reordering is
+    an arrival of something that is not the oldest; a storm is a run of teleports.
+    """
+    step = st.integers(0, 2)
+    fault = st.tuples(st.sampled_from(FAULTS), st.integers(0, 4095))
+    calm = st.lists(step, min_size=1, max_size=4).map(
+        lambda steps: [a for s in steps for a in (("walk", s), *ARRIVE)]
+    )
+    trouble = st.tuples(
+        st.lists(step, min_size=1, max_size=4), st.lists(fault, min_size=1, max_size=3)
+    )
+    troubled = trouble.map(lambda t: [*(("walk", s) for s in t[0]), *t[1], *ARRIVE])
+    stall = st.lists(step, min_size=2, max_size=6).map(lambda steps: [("walk", s) for s in steps])
+    storm = st.lists(st.integers(0, PLACES - 1), min_size=1, max_size=3).map(
+        lambda places: [a for place in places for a in (("teleport", place), *ARRIVE)]
+    )
+    part = st.one_of(calm, troubled, troubled, troubled, stall, storm)
+    begun = st.sampled_from([[], [("walk", 1), *ARRIVE, *ARRIVE]])
+    parts = st.lists(part, min_size=2, max_size=8)
+    return st.tuples(begun, parts).map(lambda t: [*t[0], *(a for p in t[1] for a in p)])
