@@ -34,8 +34,8 @@ from nebula.session_config import SessionConfig, load_session_config
 NOTES = (
     "Timing is of fidelity `analytic`: each unit's cycles are bounds from counters of this run, "
     "and the slowest unit sets the frame time; no queueing between units is simulated.",
-    "Search is `flat` (every node, every time; `nebula search --compare` times the others), and the "
-    "cloud's computing time is an assumption, listed under sources.",
+    "Search is `flat` (every node, every time; `nebula search --compare` times the others), and "
+    "the cloud's computing time is an assumption, listed under sources.",
     "The link loses nothing; messages arrive in order.",
     "Image arithmetic is float32; `nebula figure formats` says what fixed point would change.",
     "The paper's six data sets are not available here; its figures are compared only where they do "
