@@ -1,5 +1,5 @@
 """``python -m nebula``."""
 
-from nebula.cli import main
+from nebula.program import main
 
 main()

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from lod_cloud import load_tree
-from nebula.cli import main
 from nebula.config import configs_root
 from nebula.options import TiledTree, tiled_tree
+from nebula.program import main
 
 
 def run(*arguments: str) -> int:

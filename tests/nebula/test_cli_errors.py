@@ -20,9 +20,10 @@ from gaussians import parallel
 from gaussians.cameras import DISPLAYS
 from gaussians.errors import InputError
 from nebula import options as nebula_options
-from nebula.cli import cli, main
+from nebula.cli import cli
 from nebula.options import SceneOptions
 from nebula.output import CommandResult
+from nebula.program import main
 from nebula.progress import progress
 
 COMMANDS = {
@@ -298,7 +299,7 @@ def test_help_is_quick_and_imports_nothing_heavy() -> None:
 import sys, time
 start = time.perf_counter()
 import nebula
-from nebula.cli import main
+from nebula.program import main
 try:
     main(["--help"])
 except SystemExit as end:
@@ -316,7 +317,7 @@ print("\\n", seconds, sorted(heavy & set(sys.modules)))
 
 WAITING = """
 import os, signal, sys, types, time
-from nebula.cli import main
+from nebula.program import main
 from nebula.output import OutputDirectory
 module = types.ModuleType("nebula.area")
 def run(options):
@@ -346,7 +347,7 @@ def test_a_signal_leaves_nothing_half_written(name: str, status: int, tmp_path: 
 def test_a_reader_that_has_seen_enough_is_no_error() -> None:
     code = """
 import subprocess, sys, types
-from nebula.cli import main
+from nebula.program import main
 from nebula.output import CommandResult
 def run(options):
     for _ in range(1000):

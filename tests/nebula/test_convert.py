@@ -20,9 +20,9 @@ from gaussians.scene import FIELDS, Scene
 from gaussians.synthetic import generate_city
 from gaussians.transforms import transformed, up_rotation
 from lod_cloud import SearchRequest, build_tree, flat_search
-from nebula.cli import main
 from nebula.convert import SUFFIXES, run
 from nebula.options import ConvertOptions, scene_options
+from nebula.program import main
 from nebula.report import stable_part
 from tests.gaussians.real_data import data_file
 from tests.gaussians.test_transforms import random_scene

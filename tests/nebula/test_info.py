@@ -11,9 +11,9 @@ import pytest
 from gaussians.formats import write_ply
 from gaussians.placement import parse_view
 from gaussians.scene import Scene
-from nebula.cli import main
 from nebula.info import run
 from nebula.options import InfoOptions, scene_options
+from nebula.program import main
 from tests.gaussians.real_data import data_file
 from tests.gaussians.test_transforms import random_scene
 

@@ -24,7 +24,8 @@ from gaussians.render import StereoRenderer, render_stereo
 from gaussians.stereo_causes import CAUSE_NAMES, LADDER
 from gaussians.stereo_method import PRESETS
 from gaussians.synthetic import HOSTILE, generate_city
-from nebula.cli import cli, main
+from nebula.cli import cli
+from nebula.program import main
 from nebula.scene_input import head_trace
 
 CITY = ("--city-leaves", "1500", "--width", "64", "--height", "48")
