@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from gaussians.errors import InputError
 from gaussians.parallel import run_chunks
@@ -122,28 +123,49 @@ def _train_stage(vectors: Float64, words: int, rng: np.random.Generator) -> NDAr
     return np.unique(means.cluster_centers_.astype(np.float16), axis=0)
 
 
+class _Search(NamedTuple):
+    """A book as it is searched."""
+
+    book: Float64  # [words, dimensions]
+    norms: Float64  # [words] squared lengths
+    narrow: Float32  # [dimensions + 1, words] what a row and a 1 are multiplied with
+    longest: float
+
+    @classmethod
+    def of(cls, book: NDArray[np.float16]) -> _Search:
+        wide = book.astype(np.float64)
+        norms = (wide * wide).sum(axis=1)
+        narrow = np.vstack([-2 * wide.T, norms]).astype(np.float32)
+        return cls(wide, norms, narrow, math.sqrt(norms.max()))
+
+
 def _nearest(vectors: Float64, book: NDArray[np.float16]) -> NDArray[np.int64]:
     """[N] index of the nearest word; the lower one of two at the same distance."""
     best = np.empty(len(vectors), np.int64)
-    with threadpool_limits(1):
-        run_chunks(_nearest_range, len(vectors), vectors, book.astype(np.float64), best)
+    with _linear_algebra().limit(limits=1):
+        run_chunks(_nearest_range, len(vectors), vectors, _Search.of(book), best)
     return best
 
 
-def _nearest_range(begin: int, end: int, vectors: Float64, book: Float64, best: Any) -> None:
+@cache
+def _linear_algebra() -> ThreadpoolController:
+    """Looking for the library takes milliseconds."""
+    return ThreadpoolController()
+
+
+def _nearest_range(begin: int, end: int, vectors: Float64, search: _Search, best: Any) -> None:
     """Distances in float32 first; rows whose two best differ by less than the rounding bound of a
     dot product in any order are decided by exact distances in float64.
     """
-    norms = (book * book).sum(axis=1)
-    narrow = np.vstack([-2 * book.T, norms]).astype(np.float32)
-    longest = math.sqrt(norms.max())
+    book, norms, narrow, longest = search
     block = max(1, _BLOCK // len(book))
     for low in range(begin, end, block):
         rows = vectors[low : min(low + block, end)]
         lengths = np.sqrt((rows * rows).sum(axis=1))
         bounds = (book.shape[1] + 4) * FLOAT32_STEP * (2 * lengths * longest + longest**2)
-        ones = np.ones((len(rows), 1), np.float32)
-        distances = np.hstack([rows.astype(np.float32), ones]) @ narrow
+        wide = np.ones((len(rows), book.shape[1] + 1), np.float32)
+        wide[:, :-1] = rows
+        distances = wide @ narrow
         numbers = np.arange(len(rows))
         first = distances.argmin(axis=1)
         least = distances[numbers, first].astype(np.float64)

@@ -1,7 +1,8 @@
-"""Number formats of the Gaussian stream: 16-bit fixed point per field (codebook.py: harmonics).
+"""Number formats of the Gaussian stream, one per kind of field (codebook.py: harmonics).
 
 The paper's coding (Sec. 4.3): attributes are coded independently of each other; every attribute is
 16-bit fixed point but the spherical harmonics above degree 0 ("AC"), which are vector-quantised.
+Fields that also serve with fewer codes take the largest code as ``top``.
 Where the paper names no range, the range comes from the scene, and a value outside it is reported,
 never clipped: ``encode`` returns the codes and which values are valid.
 
@@ -49,6 +50,7 @@ class LinearField:
 
     low: float
     high: float
+    top: int = TOP
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
@@ -56,7 +58,7 @@ class LinearField:
 
     @property
     def step(self) -> float:
-        return (self.high - self.low) / TOP
+        return (self.high - self.low) / self.top
 
     @property
     def max_error(self) -> float:
@@ -105,7 +107,7 @@ class SquareRootField:
 
 @dataclass(frozen=True)
 class LogField:
-    """0 exactly, and 65535 values spaced evenly in the logarithm over 2**low .. 2**high.
+    """0 exactly, and ``top`` values spaced evenly in the logarithm over 2**low .. 2**high.
 
     To the nearest: relative error at most ``max_ratio - 1``. With ``round_up`` the decoded value
     is never below the original and at most ``max_ratio`` times it.
@@ -114,6 +116,7 @@ class LogField:
     low: float
     high: float
     round_up: bool = False
+    top: int = TOP
 
     def __post_init__(self) -> None:
         if not (-150 <= self.low < self.high <= 128):
@@ -122,20 +125,20 @@ class LogField:
             )
 
     @classmethod
-    def covering(cls, values: Float32, *, round_up: bool = False) -> LogField:
+    def covering(
+        cls, values: Float32 | Float64, *, round_up: bool = False, top: int = TOP
+    ) -> LogField:
         """The range of the positive ones of these values, its ends widened to multiples of 1/64."""
         positive = values[values > 0].astype(np.float64)
         if not len(positive):
-            return cls(-1.0, 1.0, round_up)
-        low, high = np.log2(positive.min()), np.log2(positive.max())
-        return cls(
-            float(np.floor(low * 64 - 0.01) / 64), float(np.ceil(high * 64 + 0.01) / 64), round_up
-        )
+            return cls(-1.0, 1.0, round_up, top)
+        ends = np.log2([positive.min(), positive.max()]) * 64 + [-0.01, 0.01]
+        return cls(float(np.floor(ends[0]) / 64), float(np.ceil(ends[1]) / 64), round_up, top)
 
     @property
     def step(self) -> float:
         """Step of the base-2 logarithm."""
-        return (self.high - self.low) / (TOP - 1)
+        return (self.high - self.low) / (self.top - 1)
 
     @property
     def max_ratio(self) -> float:
@@ -144,32 +147,32 @@ class LogField:
 
     @cached_property
     def _table(self) -> Float32:
-        """[65536] decoded values."""
-        values = exp2(self.low + np.arange(-1, TOP, dtype=np.float64) * self.step)
+        """[top + 1] decoded values."""
+        values = exp2(self.low + np.arange(-1, self.top, dtype=np.float64) * self.step)
         values[0] = 0.0
         return values.astype(np.float32)
 
     @cached_property
     def _limits(self) -> Float64:
-        """[65537] code n stands for values in limits[n] .. limits[n + 1]; nearest only."""
-        inner = exp2(self.low + (np.arange(-1, TOP + 1, dtype=np.float64) - 0.5) * self.step)
+        """[top + 2] code n stands for values in limits[n] .. limits[n + 1]; nearest only."""
+        inner = exp2(self.low + (np.arange(-1, self.top + 1, dtype=np.float64) - 0.5) * self.step)
         inner[0] = 0.0
         return inner
 
-    def encode(self, values: Float32) -> tuple[UInt16, Mask]:
+    def encode(self, values: Float32 | Float64) -> tuple[UInt16, Mask]:
         wide = values.astype(np.float64)
-        floor = 2.0 ** (self.low - self.step)
+        floor = 2.0 ** (self.low - self.step * (1.0 if self.round_up else 0.5))
         valid = (wide == 0) | ((wide >= floor) & (wide <= np.float64(self._table[-1])))
         inside = np.where(valid & (wide > 0), wide, 1.0 if self.low <= 0 <= self.high else floor)
         guess = (np.log2(inside) - self.low) / self.step + 1
         if self.round_up:
-            codes = np.clip(np.ceil(guess), 1, TOP).astype(np.int32)
+            codes = np.clip(np.ceil(guess), 1, self.top).astype(np.int32)
             codes -= (codes > 1) & (self._table[codes - 1] >= inside)
-            codes += (codes < TOP) & (self._table[codes] < inside)
+            codes += (codes < self.top) & (self._table[codes] < inside)
         else:
-            codes = np.clip(np.rint(guess), 1, TOP).astype(np.int32)
+            codes = np.clip(np.rint(guess), 1, self.top).astype(np.int32)
             codes -= (codes > 1) & (inside < self._limits[codes])
-            codes += (codes < TOP) & (inside >= self._limits[codes + 1])
+            codes += (codes < self.top) & (inside >= self._limits[codes + 1])
         return np.where(wide > 0, codes, 0).astype(np.uint16), valid
 
     def decode(self, codes: UInt16) -> Float32:
@@ -213,14 +216,13 @@ class PositionField:
 
 
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-_ROTATION_STEP = math.sqrt(2.0) / (TOP - 1)  # an even number of steps: zero is a code
 
 
-def encode_rotation(quaternions: Float32) -> tuple[NDArray[np.uint8], UInt16]:
+def encode_rotation(quaternions: Float32, top: int = TOP) -> tuple[NDArray[np.uint8], UInt16]:
     """Smallest three: which component is largest [N], and the other three [N, 3] over +-1/sqrt(2).
 
     The quaternion is normalised first. The decoded rotation differs by at most
-    ``ROTATION_ERROR_RAD``.
+    ``ROTATION_ERROR_RAD``, times 65535 / ``top`` with fewer codes.
     """
     wide = quaternions.astype(np.float64)
     wide /= np.sqrt((wide * wide).sum(axis=1, keepdims=True))
@@ -228,16 +230,20 @@ def encode_rotation(quaternions: Float32) -> tuple[NDArray[np.uint8], UInt16]:
     rows = np.arange(len(wide))
     sign = np.where(wide[rows, largest] < 0, -1.0, 1.0)
     three = wide[rows[:, None], _OTHERS[largest]] * sign[:, None]
-    codes = np.rint(three / _ROTATION_STEP) + (TOP - 1) // 2
-    return largest.astype(np.uint8), np.clip(codes, 0, TOP - 1).astype(np.uint16)
+    codes = np.rint(three / _rotation_step(top)) + (top - 1) // 2
+    return largest.astype(np.uint8), np.clip(codes, 0, top - 1).astype(np.uint16)
 
 
-def decode_rotation(largest: NDArray[np.uint8], codes: UInt16) -> Float32:
+def decode_rotation(largest: NDArray[np.uint8], codes: UInt16, top: int = TOP) -> Float32:
     """[N, 4] unit quaternions; the omitted component is positive."""
-    three = (codes.astype(np.float64) - (TOP - 1) // 2) * _ROTATION_STEP
+    three = (codes.astype(np.float64) - (top - 1) // 2) * _rotation_step(top)
     rest = np.maximum(1.0 - (three * three).sum(axis=1), 0.0)
     quaternions = np.empty((len(three), 4), np.float64)
     rows = np.arange(len(three))
     quaternions[rows, largest] = np.sqrt(rest)
     quaternions[rows[:, None], _OTHERS[largest]] = three
     return quaternions.astype(np.float32)
+
+
+def _rotation_step(top: int) -> float:
+    return math.sqrt(2.0) / (top - 1)  # an even number of steps: zero is a code

@@ -16,9 +16,11 @@ SHARED_SOURCES = (
     "gaussians/lanes.py",
     "lod_cloud/criterion.py",
     "lod_cloud/moments.py",
+    "lod_cloud/pairing.py",
     "lod_cloud/search/marks.py",
     "lod_cloud/search/prefetching.py",
     "lod_cloud/search/sectors.py",
+    "lod_cloud/search_arrays.py",
 )
 
 

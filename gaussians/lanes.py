@@ -74,6 +74,21 @@ def count(mask: Mask) -> int:
     return int(np.count_nonzero(mask))
 
 
+def bits(mask: Mask) -> int:
+    """The lanes of a mask (not of a pair) as the bits of a number, the first lane lowest."""
+    return int(np.packbits(mask, bitorder="little").view(np.uint16)[0])
+
+
+def lowest_bit(number: int) -> int:
+    """Place of the lowest bit that is set, 0 for the number 1; of a number > 0."""
+    return (number & -number).bit_length() - 1
+
+
+def highest_bit(number: int) -> int:
+    """Place of the highest bit that is set; of a number > 0."""
+    return int(number).bit_length() - 1
+
+
 def scaled(value: Any, exponent: Any) -> Any:
     """value * 2**k, for lanes or one float32; ``exponent`` is the float32 number 1.5*2**23 + k.
 
@@ -193,6 +208,23 @@ for _lanes, _mask in ((_LANES, _MASK), (_PAIR, _PAIR_MASK)):
     def _count(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
         bits = builder.bitcast(values[0], ir.IntType(values[0].type.count))
         return builder.zext(builder.ctpop(bits), context.get_value_type(types.intp))
+
+
+@_implement(bits, types.intp, _MASK)
+def _bits(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
+    number = builder.bitcast(values[0], ir.IntType(WIDTH))
+    return builder.zext(number, context.get_value_type(types.intp))
+
+
+@_implement(lowest_bit, types.intp, types.intp)
+def _lowest_bit(_context: Any, builder: Any, _signature: Any, values: Any) -> Any:
+    return builder.cttz(values[0], ir.Constant(_BIT, 1))
+
+
+@_implement(highest_bit, types.intp, types.intp)
+def _highest_bit(_context: Any, builder: Any, _signature: Any, values: Any) -> Any:
+    zeros = builder.ctlz(values[0], ir.Constant(_BIT, 1))
+    return builder.sub(ir.Constant(zeros.type, zeros.type.width - 1), zeros)
 
 
 for _kind in (_LANES, _PAIR, _NUMBER):

@@ -64,8 +64,9 @@ class Scene:
             array = getattr(self, field)
             if array.dtype != np.float32:
                 raise InputError(f"{name}: {field} must be float32, not {array.dtype}")
-            finite = np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
+            finite = np.isfinite(array)
             if not finite.all():
+                finite = finite.all(axis=tuple(range(1, array.ndim)))
                 bad = int(np.argmin(finite))
                 raise InputError(
                     f"{name}: {field} must be finite; {int((~finite).sum())} of {count} Gaussians "
@@ -81,7 +82,8 @@ class Scene:
                 f"{name}: opacities must lie in 0..{OPACITY_LIMIT:g}; "
                 f"Gaussian {bad} has {self.opacities[bad]}"
             )
-        norms = np.linalg.norm(self.quaternions.astype(np.float64), axis=1)
+        quaternions = self.quaternions.astype(np.float64)
+        norms = np.sqrt(np.einsum("ij,ij->i", quaternions, quaternions))
         if count and np.abs(norms - 1).max() > 1e-3:
             bad = int(np.argmax(np.abs(norms - 1)))
             raise InputError(

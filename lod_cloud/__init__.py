@@ -2,8 +2,8 @@
 
 from lod_cloud.build import BuildOptions, BuildTimes, build_tree, build_tree_files
 from lod_cloud.client import Client, ReceiveStats, Selection
-from lod_cloud.cloud import Cloud, CutChange, SearchStats
-from lod_cloud.codec import PaperCodec
+from lod_cloud.cloud import Cloud
+from lod_cloud.codec import Codec, CompactCodec, PaperCodec
 from lod_cloud.criterion import SearchRequest, prove_nesting
 from lod_cloud.cut import Cut, difference, is_complete, overlap
 from lod_cloud.delta_cut import DeltaCut, Probe, Report
@@ -13,6 +13,7 @@ from lod_cloud.lod_tree import LodTree, TreeMetadata
 from lod_cloud.management_table import ManagementTable
 from lod_cloud.protocol import LocalProtocolError, RemoteProtocolError
 from lod_cloud.search import Search, SearchResult, SearchTree, flat_search, make_search
+from lod_cloud.search_stats import SearchStats
 from lod_cloud.tree_encoder import TreeEncoder
 from lod_cloud.tree_files import load_tree, save_tree, verify_tree
 
@@ -21,8 +22,9 @@ __all__ = [
     "BuildTimes",
     "Client",
     "Cloud",
+    "Codec",
+    "CompactCodec",
     "Cut",
-    "CutChange",
     "DeltaCut",
     "LeafSpool",
     "Link",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import mmap
 import os
 import threading
 import time
@@ -85,3 +86,15 @@ class ArrayFile:
         yield
         with self._lock:
             self.seconds += time.perf_counter() - begin
+
+
+def release_pages(array: NDArray[Any]) -> None:
+    """Let go of the pages of a memory-mapped array, and of changes to it; nothing for another one.
+
+    The array stays as it is on disk: what is read of it again is mapped again.
+    """
+    base: Any = array
+    while base is not None and not isinstance(base, mmap.mmap):
+        base = getattr(base, "base", None)
+    if base is not None and hasattr(mmap, "MADV_DONTNEED"):  # not on every platform
+        base.madvise(mmap.MADV_DONTNEED)

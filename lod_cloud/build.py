@@ -1,9 +1,9 @@
 """Builds the LoD tree of a scene, in memory or straight into a directory.
 
 *Structure*: the Gaussians are split at the median of the longest axis of their means' box, as in
-HierGS (doi:10.1145/3658160), down to groups of ``pair_within`` neighbours, in which the cheapest
-pair merges first (`lod_cloud.merge`; 1 splits down to the leaves). Small steps can be left out
-(``fan_out_ratio``, `lod_cloud.numbering`). *Interior nodes*: the merge of their children. *Node
+HierGS (doi:10.1145/3658160); on the way back up, the cheapest pair of ``pair_within`` neighbours
+merges first (`lod_cloud.merge`; 1 makes the nodes those of the split). Small steps can be left
+out (``fan_out_ratio``, `lod_cloud.numbering`). *Interior nodes*: the merge of their children. *Node
 spheres*, float64 rounded up to float32, from the node's own 3-sigma box (axis-aligned, centred at
 its mean) and its children's spheres:
 
@@ -31,9 +31,11 @@ from lod_cloud.array_file import ArrayFile
 from lod_cloud.criterion import LENGTH_LIMIT_M, prove_nesting
 from lod_cloud.harmonics import MemoryRows, Rows, merge_harmonics
 from lod_cloud.lod_tree import Int32, LodTree, Point, TreeMetadata
-from lod_cloud.merge import MOST_LEAVES, Nodes, merge_leaves
+from lod_cloud.merge import Nodes, merge_leaves
 from lod_cloud.numbering import Numbering, number_nodes
-from lod_cloud.split import split_order, upper_tree
+from lod_cloud.pairing import MOST_SLOTS
+from lod_cloud.spheres import tighten_spheres
+from lod_cloud.split import split_order
 from lod_cloud.tree_files import TreeWriter
 
 PAIR_WITHIN = 16
@@ -45,12 +47,12 @@ _WRITTEN_ROWS = 1 << 16
 class BuildOptions:
     """How leaves become a tree. Raises InputError for values out of range."""
 
-    pair_within: int = PAIR_WITHIN  # leaves of a group whose cheapest pairs merge first; 1: none
+    pair_within: int = PAIR_WITHIN  # neighbours whose cheapest pairs merge first; 1: none
     fan_out_ratio: float = 1.0  # nodes larger than this share of their parent are left out
 
     def __post_init__(self) -> None:
-        if not 1 <= self.pair_within <= MOST_LEAVES:
-            raise InputError(f"pair_within must lie in 1..{MOST_LEAVES}, not {self.pair_within}")
+        if not 1 <= self.pair_within <= MOST_SLOTS:
+            raise InputError(f"pair_within must lie in 1..{MOST_SLOTS}, not {self.pair_within}")
         if not 0 < self.fan_out_ratio <= 1:
             raise InputError(f"fan_out_ratio must lie in 0..1, not {self.fan_out_ratio}")
 
@@ -169,18 +171,18 @@ def _skeleton(
     scene: Scene, options: BuildOptions, release: Callable[[], None] = lambda: None
 ) -> _Skeleton:
     _check(scene, release)
-    group = min(options.pair_within, len(scene))
-    ids = split_order(scene.means, group)
-    upper = upper_tree(len(scene), group)
+    ids = split_order(scene.means, options.pair_within)
     release()
-    nodes, children = merge_leaves(scene, ids, upper, release=release)
+    nodes, children = merge_leaves(scene, ids, options.pair_within, release=release)
     densest = nodes.opacities.max()
     if not densest <= OPACITY_LIMIT:
         raise InputError(
             f"merged opacities must not exceed {OPACITY_LIMIT:g}, not reach {densest:g}: "
             "too many Gaussians lie on top of each other"
         )
-    numbering = number_nodes(children, upper.root, nodes.extent, options.fan_out_ratio)
+    numbering = number_nodes(children, 2 * len(scene) - 2, nodes.extent, options.fan_out_ratio)
+    if options.fan_out_ratio < 1:
+        tighten_spheres(numbering, nodes)
     leaf_id = np.full(len(numbering), -1, np.int32)
     leaves = np.flatnonzero(numbering.child_count == 0)
     leaf_id[leaves] = ids[numbering.nodes[leaves]]
@@ -213,7 +215,8 @@ def _check(scene: Scene, release: Callable[[], None]) -> None:
 
 
 def _bounds(scene: Scene) -> tuple[Point, Point]:
-    low, high = (tuple(float(v) for v in f(scene.means, axis=0)) for f in (np.min, np.max))
+    axes = scene.means.T  # one at a time: along the first axis of three numbers numpy is slow
+    low, high = (tuple(float(f(axis)) for axis in axes) for f in (np.min, np.max))
     return low, high  # type: ignore[return-value]  # two tuples of three by construction
 
 
@@ -221,6 +224,7 @@ def _record(options: BuildOptions) -> dict[str, object]:
     return {
         "split": "median of the longest axis",
         "merge": "opacity x surface",
+        "interior": "merged",  # of their children; nothing was trained afterwards
         "margin": "2^-19",
         "pair_within": options.pair_within,
         "fan_out_ratio": options.fan_out_ratio,

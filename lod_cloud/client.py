@@ -11,7 +11,7 @@ import numpy as np
 from gaussians.errors import InputError
 from gaussians.scene import Scene
 from lod_cloud.criterion import SearchRequest
-from lod_cloud.delta_cut import DeltaCut, Probe, Report
+from lod_cloud.delta_cut import DeltaCut, Probe, Report, same_codec
 from lod_cloud.events import Events
 from lod_cloud.lod_tree import Int32
 from lod_cloud.management_table import ManagementTable, TableChange
@@ -32,7 +32,25 @@ from lod_cloud.subgraph import LocalSubgraph
 
 EARLY_MESSAGES = 64  # kept until what they follow arrives
 
-_Applied = tuple[TableChange, int, int]  # what changed, payloads, nodes that left the cut
+
+@dataclass(frozen=True)
+class _Applied:
+    """One change."""
+
+    change: TableChange
+    payloads: int
+    merged: int
+    left: int  # nodes that left the cut
+
+
+@dataclass(frozen=True)
+class _Arrival:
+    """What a message says, in nodes."""
+
+    entered: Int32  # the cut; ascending
+    left: Int32
+    fresh: NodeRecords  # that came or were merged, known before or not
+    merged: int
 
 
 @dataclass(frozen=True)
@@ -46,6 +64,7 @@ class ReceiveStats:
     message_bytes: int
     applied: int  # changes
     payloads: int
+    merged: int  # nodes computed from their children instead of sent
     reactivated: int
     removed: int
     evicted: int
@@ -155,7 +174,11 @@ class Client:
             )
         if self._start is None:
             raise RemoteProtocolError("session start must come before any search result")
-        news = DeltaCut.from_bytes(body) if kind == DELTA_CUT else Probe.from_bytes(body)
+        news = (
+            DeltaCut.from_bytes(body, self._start.child_numbers)
+            if kind == DELTA_CUT
+            else Probe.from_bytes(body)
+        )
         if news.session != self._start.session:
             raise RemoteProtocolError(f"session must be {self._start.session}, not {news.session}")
         self._seen = max(self._seen, news.sequence)
@@ -175,7 +198,8 @@ class Client:
             if start.to_bytes() != self._start.to_bytes():
                 raise RemoteProtocolError(f"session {start.session} must not start in two ways")
             return
-        table = ManagementTable(start.nodes, start.frames_per_search, start.reuse_window_frames)
+        nodes = start.child_numbers.nodes
+        table = ManagementTable(nodes, start.frames_per_search, start.reuse_window_frames)
         self._start, self.table = start, table
         self._subgraph, self._newest = LocalSubgraph(start.codec.sh_degree), None
         self._early = {}
@@ -204,18 +228,20 @@ class Client:
         codec = self._start.codec
         if delta.frame <= self.frame:
             raise RemoteProtocolError(f"frame must be above {self.frame}, not {delta.frame}")
-        if delta.codec_hash != codec.version:
+        if not same_codec(delta.codec_hash, codec.version):
             raise RemoteProtocolError(
-                f"codebook version must be {codec.version:#x}, not {delta.codec_hash:#x}"
+                f"codebook version must be {codec.version:#x}, not ...{delta.codec_hash:08x}"
             )
         table = self.table if delta.base else self.table.emptied()
         self._strayed += 1  # until it is known to be right
         if delta.events is None:
-            arrived = codec.decode(delta.payload)
-            entered, left = np.sort(np.concatenate([arrived.ids, delta.reactivated])), delta.removed
+            nodes = codec.decode(delta.payload)
+            entered = np.sort(np.concatenate([nodes.ids, delta.reactivated]))
+            arrival = _Arrival(entered, delta.removed, nodes, 0)
         else:
-            entered, left, arrived = self._from_events(delta.events, delta.payload)
-        change = _prepared(table, delta, entered, left, arrived)
+            arrival = self._from_events(delta.events, delta.payload)
+        arrived = arrival.fresh
+        change = _prepared(table, delta, arrival)
         fresh = np.isin(arrived.ids, change.needed, assume_unique=True)
         if delta.base == delta.sequence - 1 and not fresh.all():
             raise RemoteProtocolError(
@@ -224,19 +250,24 @@ class Client:
         self._strayed = 0
         if delta.base == 0:
             self._subgraph = LocalSubgraph(codec.sh_degree)
-        self._subgraph.apply(change, arrived if fresh.all() else arrived.take(fresh))
+        self._subgraph.apply(
+            change, arrived if fresh.all() else arrived.take(np.flatnonzero(fresh))
+        )
         table.commit(change)
         self.table, self.frame, self.applied = table, delta.frame, delta.sequence
         self._damaged = False
-        return change, len(arrived), len(left)
+        payloads = len(arrived) - arrival.merged
+        return _Applied(change, payloads, arrival.merged, len(arrival.left))
 
-    def _from_events(self, events: Events, payload: bytes) -> tuple[Int32, Int32, NodeRecords]:
-        """Nodes that entered and left the cut, and what came for them."""
+    def _from_events(self, events: Events, payload: bytes) -> _Arrival:
         assert self._start is not None and self.table is not None
-        table, graph = self.table, self._subgraph
-        found = outcome(events, table, graph)
-        places = found.needed, found.needed_parents
-        return found.entered, found.left, self._start.codec.decode(payload, places)
+        codec, graph = self._start.codec, self._subgraph
+        found = outcome(events, self.table, graph, merges=codec.merges)
+        references = graph.means(found.references) if codec.relative else None
+        arrived = codec.decode(payload, (found.sent, found.sent_parents), references)
+        if len(found.merged):
+            arrived = arrived.joined(found.merged).check()
+        return _Arrival(found.entered, found.left, arrived, len(found.merged))
 
     def _stats(self, size: int, applied: list[_Applied], refused: int = 0) -> ReceiveStats:
         assert self.table is not None
@@ -245,22 +276,21 @@ class Client:
             frame=self.frame,
             message_bytes=size,
             applied=len(applied),
-            payloads=sum(payloads for _, payloads, _ in applied),
-            reactivated=sum(change.reactivated for change, _, _ in applied),
-            removed=sum(left for _, _, left in applied),
-            evicted=sum(len(change.evicted) for change, _, _ in applied),
+            payloads=sum(one.payloads for one in applied),
+            merged=sum(one.merged for one in applied),
+            reactivated=sum(one.change.reactivated for one in applied),
+            removed=sum(one.left for one in applied),
+            evicted=sum(len(one.change.evicted) for one in applied),
             held=len(self.table),
             refused=refused,
         )
 
 
-def _prepared(
-    table: ManagementTable, delta: DeltaCut, entered: Int32, left: Int32, arrived: NodeRecords
-) -> TableChange:
+def _prepared(table: ManagementTable, delta: DeltaCut, arrival: _Arrival) -> TableChange:
     """The change that ``delta`` asks for, proved to lead to the cloud's state."""
     index = delta.search_index
     try:
-        change = table.prepare(index, entered, left, delta.dropped)
+        change = table.prepare(index, arrival.entered, arrival.left, delta.dropped)
     except InputError as error:
         raise RemoteProtocolError(str(error)) from error
     if change.state_hash != delta.state_hash:
@@ -268,6 +298,6 @@ def _prepared(
             f"search {index}: state hash must be {delta.state_hash:#018x}, "
             f"not {change.state_hash:#018x}"
         )
-    if not np.isin(change.needed, arrived.ids, assume_unique=True).all():
+    if not np.isin(change.needed, arrival.fresh.ids, assume_unique=True).all():
         raise RemoteProtocolError(f"search {index}: must bring every node that is new")
     return change

@@ -95,65 +95,52 @@ def prove_nesting(tree: LodTree, focal_px: float = PROOF_FOCAL_PX) -> int:
     up exactly), on shells a few float32 steps apart, and on the three axes to that side.
     """
     factors = [SearchRequest((0, 0, 0), focal_px, tau).factor for tau in PROOF_TAUS_PX]
-    gaussians = tree.gaussians
+    along = [(1.0, 0.0, 0.0, 0.0, shell) for shell in PROOF_SHELLS]
+    axes = [(0.0, *axis, 1.0) for axis in np.eye(3)]
+    cameras = np.tile(along + axes, (len(factors), 1)).T.copy()
+    ks = np.repeat(np.array(factors, np.float32), len(along) + len(axes))
+    means, radius, extent = tree.gaussians.means, tree.radius, tree.extent
     return sum(
         run_chunks(
             _count_violations,
             len(tree),
             tree.parent,
             tree.child_count,
-            gaussians.means,
-            tree.radius,
-            tree.extent,
-            np.array(factors, np.float32),
-            np.array(PROOF_SHELLS, np.float64),
+            means,
+            radius,
+            extent,
+            ks,
+            cameras,
         )
     )
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _count_violations(begin, end, parent, child_count, means, radius, extent, factors, shells):  # type: ignore[no-untyped-def]
+def _count_violations(begin, end, parent, child_count, means, radius, extent, ks, cameras):  # type: ignore[no-untyped-def]
+    """Cameras [5, C]: share of the way along parent to child, and along the axes; shell."""
     count = 0
-    away = np.empty(3, np.float64)
-    unit = np.empty(3, np.float64)
-    camera = np.empty(3, np.float32)
     for node in range(max(begin, 1), end):
         if child_count[node] == 0:
             continue
         above = parent[node]
-        length = 0.0
-        for axis in range(3):
-            away[axis] = np.float64(means[node, axis]) - np.float64(means[above, axis])
-            length += away[axis] * away[axis]
-        length = math.sqrt(length)
-        for k in factors:
-            distance = np.float64(radius[node] + k * extent[node])
-            for variant in range(len(shells) + 3):
-                shell = 1.0
-                for axis in range(3):
-                    unit[axis] = 0.0
-                if variant >= len(shells) or length == 0.0:
-                    axis = variant % 3
-                    unit[axis] = -1.0 if away[axis] < 0.0 else 1.0
-                else:
-                    shell = shells[variant]
-                    for axis in range(3):
-                        unit[axis] = away[axis] / length
-                for axis in range(3):
-                    camera[axis] = np.float32(means[node, axis] + unit[axis] * (distance * shell))
-                count += _violates(camera, means, radius, extent, k, node, above)
+        mx, my, mz = means[node, 0], means[node, 1], means[node, 2]
+        px, py, pz = means[above, 0], means[above, 1], means[above, 2]
+        r, e, pr, pe = radius[node], extent[node], radius[above], extent[above]
+        ax = np.float64(mx) - np.float64(px)
+        ay = np.float64(my) - np.float64(py)
+        az = np.float64(mz) - np.float64(pz)
+        sx, sy, sz = (-1.0 if ax < 0 else 1.0), (-1.0 if ay < 0 else 1.0), (-1.0 if az < 0 else 1.0)
+        length = math.sqrt(ax * ax + ay * ay + az * az)
+        if length > 0.0:
+            ax, ay, az = ax / length, ay / length, az / length
+        else:
+            ax = 1.0  # any direction
+        for i in range(np.uint64(len(ks))):  # without a branch, and so in vector instructions
+            k = ks[i]
+            away = np.float64(r + k * e) * cameras[4, i]
+            x = np.float32(mx + (cameras[0, i] * ax + cameras[1, i] * sx) * away)
+            y = np.float32(my + (cameras[0, i] * ay + cameras[2, i] * sy) * away)
+            z = np.float32(mz + (cameras[0, i] * az + cameras[3, i] * sz) * away)
+            inside = refines(x, y, z, mx, my, mz, r, e, k)
+            count += np.int64(inside) & ~np.int64(refines(x, y, z, px, py, pz, pr, pe, k))
     return count
-
-
-@njit
-def _violates(camera, means, radius, extent, k, node, above):  # type: ignore[no-untyped-def]
-    x, y, z = camera[0], camera[1], camera[2]
-    if not refines(
-        x, y, z, means[node, 0], means[node, 1], means[node, 2], radius[node], extent[node], k
-    ):
-        return 0
-    if refines(
-        x, y, z, means[above, 0], means[above, 1], means[above, 2], radius[above], extent[above], k
-    ):
-        return 0
-    return 1

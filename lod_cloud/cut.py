@@ -59,15 +59,3 @@ def without(ids: Int32, others: Int32) -> Int32:
     for changes rather than cuts.
     """
     return ids[~np.isin(ids, others, assume_unique=True)]
-
-
-def compose(first: tuple[Int32, Int32], second: tuple[Int32, Int32]) -> tuple[Int32, Int32]:
-    """Members added and removed by two changes of a set, one after the other, as one change.
-
-    Each change is (added, removed), without duplicates; so is the result, ascending.
-    """
-    (added, removed), (added_then, removed_then) = first, second
-    return (
-        np.union1d(without(added, removed_then), without(added_then, removed)),
-        np.union1d(without(removed, added_then), without(removed_then, added)),
-    )

@@ -19,17 +19,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lod_cloud.child_numbers import ChildNumbers
 from lod_cloud.columns import ColumnReader, ColumnWriter
-from lod_cloud.events import Events
+from lod_cloud.events import Events, read_ids
 from lod_cloud.lod_tree import Int32
 from lod_cloud.protocol import RemoteProtocolError
 
-# session, sequence, base, index, frame, re-activated, removed, dropped, two hashes, payload bytes,
-# whether it carries events
-_DELTA = struct.Struct("<QIIIIIIIQQQB")
+_HASHES = struct.Struct("<QI")  # state, codec
+_EVENTS, _LISTS = 1, 0
 _PROBE = struct.Struct("<QI")
 _REPORT = struct.Struct("<QIIQIB")
 _MISSING, _START_OVER = 1, 2
+_LOW_HALF = (1 << 32) - 1
+_LARGEST = (1 << 31) - 1
 
 
 @dataclass(frozen=True)
@@ -46,62 +48,57 @@ class DeltaCut:
     dropped: Int32  # ascending; not held by the client from now on
     payload: bytes  # the codec's coding of all other nodes that enter the cut
     state_hash: int  # of the management table after this message
-    codec_hash: int  # version of the codec's parameters and codebook
+    codec_hash: int  # version of the codec's parameters and codebook; its lower half travels
     events: Events | None = None  # instead of the three lists, and of ids in the payload
 
-    def to_bytes(self) -> bytes:
-        """Body of a message."""
+    def to_bytes(self, numbers: ChildNumbers) -> bytes:
+        """Body of a message in a session with these child numbers."""
         writer = ColumnWriter()
-        lists = (self.reactivated, self.removed, self.dropped)
-        writer.raw(
-            _DELTA.pack(
-                self.session,
-                self.sequence,
-                self.base,
-                self.search_index,
-                self.frame,
-                *(len(ids) for ids in lists),
-                self.state_hash,
-                self.codec_hash,
-                len(self.payload),
-                self.events is not None,
-            )
-        )
+        places = (self.session, self.sequence, self.sequence - self.base, self.search_index)
+        for number in (*places, self.frame):
+            writer.varint(number)
+        writer.raw(_HASHES.pack(self.state_hash, self.codec_hash & _LOW_HALF))
         if self.events is not None:
-            writer.raw(self.events.to_bytes())
-        for ids in lists:
-            writer.differences(ids)
+            writer.varint(_EVENTS)
+            writer.raw(self.events.to_bytes(numbers))
+        else:
+            writer.varint(_LISTS)
+            for ids in (self.reactivated, self.removed, self.dropped):
+                writer.varint(len(ids))
+                writer.ascending(ids)
         writer.raw(self.payload)
         return writer.bytes()
 
     @classmethod
-    def from_bytes(cls, body: bytes) -> DeltaCut:
+    def from_bytes(cls, body: bytes, numbers: ChildNumbers) -> DeltaCut:
         """Inverse of `to_bytes`. Raises RemoteProtocolError for anything it would not write."""
         reader = ColumnReader(body)
-        session, sequence, base, index, frame, *counts, state_hash, codec_hash, size, kind = (
-            _DELTA.unpack(reader.raw(_DELTA.size))
-        )
-        if kind > 1 or (kind == 1 and any(counts)):
+        session, sequence, back, index, frame = (reader.varint() for _ in range(5))
+        state_hash, codec_hash = _HASHES.unpack(reader.raw(_HASHES.size))
+        kind = reader.varint()
+        if kind not in (_EVENTS, _LISTS):
             raise RemoteProtocolError(f"search {index}: must carry either events or lists")
-        events = Events.read(reader) if kind else None
-        ids = [reader.differences(np.int32, count) for count in counts]
-        payload = reader.raw(size)
-        reader.finish()
-        if any(len(i) and (i[0] < 0 or (np.diff(i.astype(np.int64)) <= 0).any()) for i in ids):
-            raise RemoteProtocolError(f"search {index}: ids must be ascending and >= 0")
-        if not base < sequence:
-            raise RemoteProtocolError(f"base must be below sequence number {sequence}, not {base}")
-        reactivated, removed, dropped = ids
+        if max(sequence, index, frame) > _LARGEST:
+            raise RemoteProtocolError(f"sequence, search and frame must be at most {_LARGEST}")
+        if not 0 < back <= sequence:
+            raise RemoteProtocolError(
+                f"base must be below sequence number {sequence}, not {sequence - back}"
+            )
+        events = Events.read(reader, numbers) if kind == _EVENTS else None
+        nothing = np.empty(0, np.int32)
+        reactivated, removed, dropped = (
+            read_ids(reader) if kind == _LISTS else nothing for _ in range(3)
+        )
         return cls(
             session=session,
             sequence=sequence,
-            base=base,
+            base=sequence - back,
             search_index=index,
             frame=frame,
             reactivated=reactivated,
             removed=removed,
             dropped=dropped,
-            payload=payload,
+            payload=reader.rest(),
             state_hash=state_hash,
             codec_hash=codec_hash,
             events=events,
@@ -153,6 +150,11 @@ class Report:
             raise RemoteProtocolError(f"flags of a report must be 0 to 3, not {flags}")
         missing, start_over = bool(flags & _MISSING), bool(flags & _START_OVER)
         return cls(session, connection, applied, state_hash, seen, missing, start_over)
+
+
+def same_codec(codec_hash: int, version: int) -> bool:
+    """Whether a message with this hash is meant for the codec of this version."""
+    return codec_hash == version & _LOW_HALF
 
 
 def exactly(body: bytes, size: int) -> bytes:

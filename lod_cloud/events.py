@@ -3,21 +3,26 @@
 An event names both what leaves the cut and what enters it with one number, so a message carries
 events instead of nodes. The cloud derives them from the tree. The client turns them back into nodes
 with what it was told: it knows the number of children of every node it holds, and children have
-consecutive numbers, the first of which the event carries.
+consecutive numbers, the first of which the event carries, as its difference to what both ends
+guess (`lod_cloud.child_numbers`). A node that takes the place of its
+children is their merge, unless the event says that it is sent.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from lod_cloud.child_numbers import ChildNumbers
 from lod_cloud.columns import ColumnReader, ColumnWriter
 from lod_cloud.cut import without
 from lod_cloud.lod_tree import Int32, LodTree
 from lod_cloud.protocol import RemoteProtocolError
 
-_COLUMNS = 6
+_LARGEST = 2**31 - 1
 
 
 @dataclass(frozen=True)
@@ -28,71 +33,97 @@ class Events:
     first_children: Int32  # [E]
     fan_outs: Int32  # number of children of those of ``expanded`` that were not in the cut before
     tops: Int32  # refined before, now in the cut
-    top_parents: Int32  # of those of ``tops`` that the client does not hold
+    top_parents: Int32  # [T], -1 for the root
     inner: Int32  # refined before, now below one of ``tops``
+    inner_parents: Int32  # [I] among ``tops`` and ``inner``
+    unmerged: Int32  # of those of ``tops`` that the client does not hold: sent all the same
 
     @classmethod
-    def between(cls, tree: LodTree, added: Int32, removed: Int32, needed: Int32) -> Events:
-        """The events by which a cut gains ``added`` and loses ``removed`` (ascending); the client
-        holds all of these but ``needed``.
+    def of(cls, tree: LodTree, expanded: Int32, collapsed: Int32) -> Events:
+        """The events by which ``expanded`` become refined and ``collapsed`` stop being so, both
+        ascending; all nodes are merged that can be.
         """
-        expanded = _refined_between(tree.parent, removed, added)
-        collapsed = _refined_between(tree.parent, added, removed)
-        at_top = np.isin(collapsed, added, assume_unique=True)
-        tops = collapsed[at_top]
+        fresh = _among(expanded, tree.parent[expanded])
+        tops = collapsed[~_among(collapsed, tree.parent[collapsed])]
+        inner = without(collapsed, tops)
         return cls(
             expanded=expanded,
             first_children=tree.first_child[expanded],
-            fan_outs=tree.child_count[without(expanded, removed)],
+            fan_outs=tree.child_count[expanded[fresh]],
             tops=tops,
-            top_parents=tree.parent[tops[np.isin(tops, needed, assume_unique=True)]],
-            inner=collapsed[~at_top],
+            top_parents=tree.parent[tops],
+            inner=inner,
+            inner_parents=tree.parent[inner],
+            unmerged=inner[:0],
         )
 
-    def to_bytes(self) -> bytes:
+    def to_bytes(self, numbers: ChildNumbers) -> bytes:
         """The columns, with their lengths."""
         writer = ColumnWriter()
-        columns = self._columns()
-        writer.plain(np.array([len(column) for column in columns], np.uint32))
-        for column in columns:
-            writer.differences(column)
+        for column in (self.expanded, self.fan_outs, self.tops, self.inner, self.unmerged):
+            writer.varint(len(column))
+        writer.ascending(self.expanded)
+        writer.signed(self.first_children - numbers.first_children(self.expanded))
+        writer.integers(self.fan_outs)
+        writer.ascending(self.tops)
+        writer.signed(self.top_parents - numbers.parents(self.tops))
+        writer.ascending(self.inner)
+        collapsed = np.union1d(self.tops, self.inner)
+        writer.integers(np.diff(np.searchsorted(collapsed, self.inner_parents), prepend=0))
+        writer.ascending(np.searchsorted(self.tops, self.unmerged))
         return writer.bytes()
 
     @classmethod
-    def read(cls, reader: ColumnReader) -> Events:
+    def read(cls, reader: ColumnReader, numbers: ChildNumbers) -> Events:
         """Inverse of `to_bytes`. Raises RemoteProtocolError for anything it would not write."""
-        counts = reader.plain(np.uint32, _COLUMNS)
-        events = cls(*(reader.differences(np.int32, int(count)) for count in counts))
-        for ids in (events.expanded, events.first_children, events.tops, events.inner):
-            if len(ids) and (ids[0] < 0 or (np.diff(ids.astype(np.int64)) <= 0).any()):
-                raise RemoteProtocolError("ids of events must be ascending and >= 0")
-        if len(events.expanded) != len(events.first_children):
-            raise RemoteProtocolError("every expanded node must have a first child")
+        sizes = [reader.varint() for _ in range(5)]
+        expanded = _ids(reader.ascending(sizes[0]))
+        begins = _ids(reader.signed(sizes[0]) + numbers.first_children(expanded))
+        fan_outs = _ids(reader.integers(sizes[1]))
+        tops = _ids(reader.ascending(sizes[2]))
+        inner, unmerged = sizes[3:]
+        events = cls(
+            expanded=expanded,
+            first_children=begins,
+            fan_outs=fan_outs,
+            tops=tops,
+            top_parents=_ids(reader.signed(len(tops)) + numbers.parents(tops)),
+            inner=_ids(reader.ascending(inner)),
+            inner_parents=_ids(np.cumsum(reader.integers(inner))),
+            unmerged=_ids(reader.ascending(unmerged)),
+        )
+        if (np.diff(begins) <= 0).any():
+            raise RemoteProtocolError("first children must ascend")
         if (events.fan_outs < 1).any():
             raise RemoteProtocolError("an expanded node must have at least one child")
-        return events
+        collapsed = np.union1d(events.tops, events.inner)
+        return dataclasses.replace(
+            events,
+            inner_parents=_picked(collapsed, events.inner_parents),
+            unmerged=_picked(events.tops, events.unmerged),
+        )
 
-    def _columns(self) -> tuple[Int32, ...]:
-        firsts, tops = self.first_children, self.tops
-        return self.expanded, firsts, self.fan_outs, tops, self.top_parents, self.inner
+
+def read_ids(reader: ColumnReader) -> Int32:
+    """Ascending ids and their number."""
+    return _ids(reader.ascending(reader.varint()))
 
 
-def _refined_between(parent: Int32, tops: Int32, bottoms: Int32) -> Int32:
-    """Nodes on the paths from a member of ``tops``, included, to one of ``bottoms``, excluded."""
-    levels = [bottoms[:0]]
-    front = bottoms
-    while len(front):
-        above = np.unique(parent[front])
-        levels.append(above[above >= 0])
-        front = without(levels[-1], tops)
-    nodes = np.unique(np.concatenate(levels))
-    between = np.isin(nodes, tops, assume_unique=True)
-    if not between.any():
-        return nodes[:0]
-    row_above = np.minimum(np.searchsorted(nodes, parent[nodes]), len(nodes) - 1)
-    has_above = nodes[row_above] == parent[nodes]
-    while True:
-        grown = between | has_above & between[row_above]
-        if np.array_equal(grown, between):
-            return nodes[between]
-        between = grown
+def _ids(numbers: NDArray[np.int64]) -> Int32:
+    if len(numbers) and not -1 <= numbers.min() <= numbers.max() <= _LARGEST:
+        raise RemoteProtocolError(f"numbers of events must lie in -1..{_LARGEST}")
+    return numbers.astype(np.int32)
+
+
+def _picked(ids: Int32, rows: Int32) -> Int32:
+    if len(rows) and rows.max() >= len(ids):
+        raise RemoteProtocolError("an event must name one of the nodes that are collapsed")
+    return ids[rows]
+
+
+def _among(ids: Int32, values: Int32) -> NDArray[np.bool_]:
+    """Which of ``values`` are members of ``ids`` (ascending)."""
+    if not len(ids):
+        return np.zeros(len(values), np.bool_)
+    places = np.minimum(np.searchsorted(ids, values), len(ids) - 1)
+    return np.asarray(ids[places] == values)

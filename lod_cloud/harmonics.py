@@ -3,8 +3,11 @@
     SH = sum w_i SH_i / W    over the children i, with w_i = o_i S_i, W = sum w_i; equal weights
                              where W = 0
 
-The children of consecutive nodes are consecutive, so a block of one level needs one block of the
-level below and nothing else: memory does not grow with the tree.
+The children of consecutive nodes are consecutive, and so are theirs: the nodes below some
+neighbours of one level are one range of every level beneath. *Clumps* of at most 32 768 nodes,
+neighbours and all below them, are filled from the bottom up in memory and written range by range;
+the few nodes above the clumps read their children's rows back. Memory does not grow with the tree,
+and no leaf is looked at twice.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from typing import Protocol
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from gaussians.parallel import run_chunks
 from lod_cloud.lod_tree import Float32, Int32
@@ -21,7 +25,7 @@ from lod_cloud.merge import Nodes
 from lod_cloud.moments import surface
 from lod_cloud.numbering import Numbering
 
-_BLOCK = 1 << 14  # nodes
+_CLUMP = 1 << 15  # nodes
 
 
 class Rows(Protocol):
@@ -29,14 +33,11 @@ class Rows(Protocol):
 
     def read(self, begin: int, end: int) -> Float32: ...
 
-    def target(self, begin: int, end: int) -> Float32:
-        """[end - begin, K] to be filled and handed to ``write``."""
-
     def write(self, begin: int, rows: Float32) -> None: ...
 
 
 class MemoryRows:
-    """Rows of an array in memory; reads and writes are views of it."""
+    """Rows of an array in memory."""
 
     def __init__(self, array: Float32) -> None:
         self._array = array
@@ -44,11 +45,8 @@ class MemoryRows:
     def read(self, begin: int, end: int) -> Float32:
         return self._array[begin:end]
 
-    def target(self, begin: int, end: int) -> Float32:
-        return self._array[begin:end]
-
     def write(self, begin: int, rows: Float32) -> None:
-        """Nothing is left to do: ``rows`` is a view."""
+        self._array[begin : begin + len(rows)] = rows
 
 
 def merge_harmonics(
@@ -63,47 +61,78 @@ def merge_harmonics(
 
     ``release`` is called now and then to let go of what was read of ``sh``.
     """
-    offsets = numbering.level_offsets
-    for level in range(len(offsets) - 2, -1, -1):
-        begin, end = int(offsets[level]), int(offsets[level + 1])
-        run_chunks(_blocks, end - begin, begin, numbering, nodes, leaf_id, sh, out, release)
+    clumps, above = _clumps(numbering.parent)
+    width = sh.shape[1]
+
+    def fill(low: int, high: int, below: int, children: Float32, rows: Float32) -> None:
+        tree = numbering.first_child, numbering.child_count, numbering.nodes, leaf_id
+        _fill(low, below, *tree, nodes.opacities, nodes.scales, sh, children, rows[: high - low])
+
+    def fill_clumps(begin: int, end: int) -> None:
+        buffer = np.empty((_CLUMP, width), np.float32)
+        for low, high in clumps[begin:end]:
+            ranges = _ranges(numbering.parent, low, high)
+            free, below, children = 0, 0, buffer[:0]
+            for low, high in reversed(ranges):
+                rows = buffer[free : free + high - low]
+                fill(low, high, below, children, rows)
+                out.write(low, rows)
+                free, below, children = free + high - low, low, rows
+        release()
+
+    run_chunks(fill_clumps, len(clumps))
+    row = np.empty((1, width), np.float32)
+    for node in reversed(above):
+        first = int(numbering.first_child[node])
+        children = out.read(first, first + int(numbering.child_count[node]))
+        fill(node, node + 1, first, children, row)
+        out.write(node, row)
 
 
-def _blocks(
-    begin: int,
-    end: int,
-    offset: int,
-    numbering: Numbering,
-    nodes: Nodes,
-    leaf_id: Int32,
-    sh: Float32,
-    out: Rows,
-    release: Callable[[], None],
-) -> None:
-    for low in range(offset + begin, offset + end, _BLOCK):
-        high = min(low + _BLOCK, offset + end)
-        inner = np.flatnonzero(numbering.child_count[low:high])
-        first = last = 0
-        if len(inner):
-            final = low + int(inner[-1])
-            first = int(numbering.first_child[low + int(inner[0])])
-            last = int(numbering.first_child[final] + numbering.child_count[final])
-        rows = out.target(low, high)
-        _fill(
-            low,
-            first,
-            numbering.first_child,
-            numbering.child_count,
-            numbering.nodes,
-            leaf_id,
-            nodes.opacities,
-            nodes.scales,
-            sh,
-            out.read(first, last),
-            rows,
+def _children(parent: Int32, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The first child at or behind every node."""
+    # of the parent's type, which would be copied as a whole otherwise
+    return np.searchsorted(parent, nodes.astype(np.int32))
+
+
+def _ranges(parent: Int32, low: int, high: int) -> list[tuple[int, int]]:
+    """Neighbours low..high of one level and, level by level, all below them."""
+    ranges = []
+    while low < high:
+        ranges.append((low, high))
+        low, high = _children(parent, np.array([low, high])).tolist()
+    return ranges
+
+
+def _clumps(parent: Int32) -> tuple[list[tuple[int, int]], list[int]]:
+    """Neighbours that are at most `_CLUMP` nodes with all below them, and the nodes above those,
+    upwards from the root.
+    """
+    clumps: list[tuple[int, int]] = []
+    above: list[int] = []
+    level = np.array([0])  # nodes that are not below those of a clump
+    while len(level):
+        sizes = np.zeros(len(level), np.int64)
+        low, high = level, level + 1
+        while (low < high).any():
+            sizes += high - low
+            low, high = _children(parent, low), _children(parent, high)
+        held = 0
+        for node, size in zip(level.tolist(), sizes.tolist(), strict=True):
+            if size > _CLUMP:
+                above.append(node)
+            elif 0 < held <= _CLUMP - size and clumps[-1][1] == node:
+                clumps[-1] = clumps[-1][0], node + 1
+                held += size
+            else:
+                clumps.append((node, node + 1))
+                held = size
+        large = level[sizes > _CLUMP]
+        edges = _children(parent, large), _children(parent, large + 1)
+        level = np.concatenate(
+            [np.arange(a, b) for a, b in zip(*edges, strict=True)] or [level[:0]]
         )
-        out.write(low, rows)
-    release()
+    return clumps, above
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -34,6 +34,10 @@ class Link:
         """Seconds for which a message occupies the line."""
         return size_bytes * 8e-6 / self.rate_mbps
 
+    def bytes_in(self, duration_s: float) -> int:
+        """Whole bytes that leave within so many seconds."""
+        return int(duration_s * self.rate_mbps * 1e6 / 8)
+
     def energy_mj(self, size_bytes: int) -> float:
         """Millijoules of the client's radio for receiving so many bytes."""
         return size_bytes * self.energy_nj_per_byte * 1e-6

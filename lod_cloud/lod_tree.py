@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from gaussians.errors import InputError
 from gaussians.scene import Scene
+from lod_cloud.search_arrays import SearchArrays
 
 Int32 = NDArray[np.int32]
 Float32 = NDArray[np.float32]
@@ -46,6 +47,7 @@ class LodTree:
     extent: Float32  # [N] e of the node test, metres
     leaf_id: Int32  # [N] id in the input scene, -1 for interior nodes
     metadata: TreeMetadata
+    search_arrays: SearchArrays | None = None  # of a tree on disk: they follow from the others
 
     def __len__(self) -> int:
         return len(self.parent)

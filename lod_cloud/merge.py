@@ -8,13 +8,15 @@ Children i with opacity o_i, means m_i, covariances C_i, surfaces S = s0 s1 + s0
 
 so the mass o S of a node is that of its leaves. Where W = 0 (transparent children, or points and
 lines, which have no surface) all children weigh the same and o is the mean of their opacities;
-where only S(C) = 0, o is their weighted mean. Everything is float64, rounded once per stored
-number; above the groups, and for the spheres, it starts from the children's float32 values.
+where only S(C) = 0, o is their weighted mean. Everything is float64 from the leaves to the root,
+rounded once per stored number; spheres start from the children's float32 values.
 
-*Within a group* of neighbouring leaves the two nodes with the least ``S(C)^2 (1 + |dc|^2)^2``
-merge first, where C is their merged covariance and dc the difference of their harmonics of degree
-0. Small and alike things vanish first, which is worth 0.5
-to 0.8 dB at equal count against splitting on to the last leaf (docs/lod_tree.md).
+*What merges with what.* Ranges of leaves are halved (`lod_cloud.split`) down to groups of at most
+``pair_within``. Within a group the cheapest pair merges first (`lod_cloud.pairing`), until half of
+``pair_within`` are left; they join those of the range's other half, and so on up to the root,
+where one is left. So there are always ``pair_within`` neighbours to choose from, whatever the
+level, and no border of a group forces unlike ones together (docs/lod_tree.md has what that is
+worth). Each half keeps a single node, as in HierGS, with a ``pair_within`` of 1.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from gaussians.parallel import run_chunks
 from gaussians.scene import Scene
@@ -38,22 +41,43 @@ from lod_cloud.moments import (
     store_axes,
     surface,
 )
-from lod_cloud.split import UpperTree
+from lod_cloud.pairing import (
+    COSTS_ROW,
+    MASS,
+    MOMENTS,
+    MOST_SLOTS,
+    OPACITY,
+    RED,
+    ROW,
+    XX,
+    XY,
+    XZ,
+    YY,
+    YZ,
+    ZZ,
+    X,
+    Y,
+    Z,
+    cheapest,
+    combine,
+    find_partners,
+    judge,
+    replace,
+    restore,
+    set_aside,
+)
+from lod_cloud.split import STACK, halved
 
-# Moments of a slot, in rows of MOST_LEAVES slots: first the covariance.
-MOST_LEAVES = 64  # of a group
-_ROW = np.uint64(MOST_LEAVES)  # unsigned: see `lod_cloud.moments`
-_XX, _XY, _XZ, _YY, _YZ, _ZZ = (np.uint64(row * MOST_LEAVES) for row in range(6))
-_X, _Y, _Z = (np.uint64(row * MOST_LEAVES) for row in range(6, 9))
-_RED, _GREEN, _BLUE = (np.uint64(row * MOST_LEAVES) for row in range(9, 12))
-_OPACITY, _MASS = (np.uint64(row * MOST_LEAVES) for row in range(12, 14))
-_MEANS = 13  # rows that are weighted means; the mass is a sum
-_BLOCK_GROUPS = 1024
 NEST_MARGIN = 1.0 + 2.0**-19  # exceeds the rounding of the float32 node test
+_PIECE = 4096  # leaves, at most, that are merged on their own first
+_TAKEN_PIECES = 16  # at a time
+_NO_COLOURS = np.empty((0, 3), np.float32)
 
 
 class Nodes(NamedTuple):
-    """Nodes of an unfinished tree, numbered as in `lod_cloud.split.UpperTree`; no harmonics."""
+    """Nodes of an unfinished tree; no harmonics. Leaves come first, by their place in the order,
+    children before their parents, the root last.
+    """
 
     means: Float32  # [M, 3]
     quaternions: Float32  # [M, 4]
@@ -69,10 +93,24 @@ class Nodes(NamedTuple):
         return cls(*(np.empty(shape, np.float32) for shape in shapes))
 
 
+class _Kept(NamedTuple):
+    """What is left of ranges of leaves: nodes without parents, see `lod_cloud.pairing`."""
+
+    numbers: NDArray[np.int64]  # [ranges, 1 + keep + keep * keep] how many, nodes, costs
+    moments: NDArray[np.float64]  # [ranges, keep * MOMENTS]
+
+    @classmethod
+    def empty(cls, ranges: int, keep: int) -> _Kept:
+        return cls(
+            np.zeros((ranges, 1 + keep + keep * keep), np.int64),
+            np.empty((ranges, keep * MOMENTS)),
+        )
+
+
 def merge_leaves(
     scene: Scene,
     ids: Int32,
-    upper: UpperTree,
+    pair_within: int,
     margin: float = NEST_MARGIN,
     release: Callable[[], None] = lambda: None,
 ) -> tuple[Nodes, Int32]:
@@ -82,230 +120,170 @@ def merge_leaves(
     ``margin`` is the factor by which a node's R and e exceed its children's; ``release`` is called
     now and then to let go of what was read of the scene.
     """
-    count = len(ids)
+    count, keep = len(ids), max(1, pair_within // 2)
     nodes = Nodes.empty(2 * count - 1)
     children = np.empty((count - 1, 2), np.int32)
-    leaves = (
-        ids,
-        scene.means,
-        scene.quaternions,
-        scene.scales,
-        scene.opacities,
-        scene.sh.reshape(count, -1),
-    )
+    size = max(_PIECE, pair_within)
+    bounds = halved(count, size)
+    pieces = len(bounds) - 1
+    nothing, kept, root = (_Kept.empty(ranges, keep) for ranges in (0, pieces, 1))
+    first = (count + bounds - keep * np.arange(pieces + 1)).astype(np.int32)
 
-    def blocks(begin: int, end: int, *arguments: object) -> None:
-        for low in range(begin, end, _BLOCK_GROUPS):
-            _merge_groups(low, min(low + _BLOCK_GROUPS, end), *arguments)
-            release()
+    def merge(begin: int, end: int) -> None:
+        for low in range(begin, end, _TAKEN_PIECES):
+            high = min(low + _TAKEN_PIECES, end)
+            colours = _take(scene, ids, bounds[low], bounds[high], nodes)
+            rule = bounds[low : high + 1], first[low:], pair_within, keep, margin
+            _merge(
+                rule,
+                colours,
+                nothing,
+                _Kept(kept.numbers[low:], kept.moments[low:]),
+                nodes,
+                children,
+            )
+        release()
 
-    places = np.arange(count, dtype=np.int32)
-    run_chunks(blocks, upper.groups, upper.bounds, places, count, *leaves, nodes, children, margin)
-    first = 2 * count - upper.groups
-    no_leaves = (ids[:0], *leaves[1:])
-    for level in range(len(upper.level_offsets) - 2, -1, -1):  # pairs of halves
-        begin, end = (int(v) for v in upper.level_offsets[level : level + 2])
-        pairs = np.arange(0, 2 * (end - begin) + 1, 2, dtype=np.int32)
-        members = upper.children[begin:end].reshape(-1)
-        run_chunks(
-            _merge_groups,
-            end - begin,
-            pairs,
-            members,
-            first + begin,
-            *no_leaves,
-            nodes,
-            children,
-            margin,
-        )
+    run_chunks(merge, pieces)
+    first = np.array([2 * count - kept.numbers[:, 0].sum()], np.int32)
+    whole = np.array([0, count], np.int32)
+    _merge((whole, first, size, 1, margin), _NO_COLOURS, kept, root, nodes, children)
     return nodes, children
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _merge_groups(  # type: ignore[no-untyped-def]
-    begin, end, bounds, members, base, ids, means, quaternions, scales, opacities, sh, nodes,
-    children, margin,
-):  # fmt: skip
-    """Merge members bounds[g]..bounds[g + 1] of every group to one node; the new ones of group g
-    are numbered from base + bounds[g] - g. With ``ids`` the members are leaves, and stored first.
+def _take(scene: Scene, ids: Int32, low: int, high: int, nodes: Nodes) -> Float32:
+    """Leaves to their places; returns [high - low, 3] their harmonics of degree 0.
+
+    One array after the other: that hides how far apart in memory they are.
     """
-    most = 1
-    for group in range(begin, end):
-        most = max(most, bounds[group + 1] - bounds[group])
-    slots = np.empty(most, np.int32)  # nodes that have no parent yet, and their moments
-    moments = np.zeros((_MEANS + 1) * MOST_LEAVES)
-    costs = np.empty((most, most))  # of pairs of slots, below the diagonal
-    fresh = np.empty(most)
-    lanes, jobs = np.zeros(ROWS * LANES), np.empty(LANES, np.int32)
+    rows = ids[low:high]
+    for name in ("means", "quaternions", "scales", "opacities"):
+        # mode "clip" writes to ``out`` directly; every id is within the scene
+        np.take(getattr(scene, name), rows, axis=0, out=getattr(nodes, name)[low:high], mode="clip")
+    return scene.sh[rows, 0]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _merge(rule, colours, below, out, nodes, children):  # type: ignore[no-untyped-def]
+    """Merge the leaves bounds[r]..bounds[r + 1] of every range r until ``leave`` are left; its new
+    nodes are numbered from first[r].
+
+    Ranges of at most ``least`` leaves are what was kept ``below``; with nothing there, leaves.
+    """
+    # arrays on their own: taken from a tuple again and again, they are counted every time
+    bounds, first, least, leave, margin = rule
+    means, quaternions, scales, opacities, radius, extent = nodes
+    below_numbers, below_moments = below
+    out_numbers, out_moments = out
+    keep = out_moments.shape[1] // MOMENTS
+    leaves = len(children) + 1
+    held_numbers = np.empty((STACK, out_numbers.shape[1]), np.int64)
+    held_moments = np.empty((STACK, out_moments.shape[1]))
+    numbers = np.empty(MOST_SLOTS, np.int64)  # of the nodes in slots
+    moments = np.zeros((MOMENTS + 1) * MOST_SLOTS)
+    costs = np.empty(MOST_SLOTS * np.int64(COSTS_ROW), np.int64)
+    partners = np.empty(MOST_SLOTS, np.int64)
+    lanes, jobs = np.zeros(ROWS * LANES), np.empty(LANES, np.int64)
     masses = np.empty((2, LANES))
     waiting = 0
-    leaves = len(children) + 1
-    for group in range(begin, end):
-        low, high = bounds[group], bounds[group + 1]
-        for at in range(low, high):
-            node, slot = members[at], at - low
-            slots[slot] = node
-            if len(ids):
-                leaf = ids[node]
-                for axis in range(3):
-                    nodes.means[node, axis] = means[leaf, axis]
-                    nodes.scales[node, axis] = scales[leaf, axis]
-                    moments[np.uint64(axis) * _ROW + _RED + np.uint64(slot)] = sh[leaf, axis]
-                for axis in range(4):
-                    nodes.quaternions[node, axis] = quaternions[leaf, axis]
-                nodes.opacities[node] = opacities[leaf]
-            _enter(node, slot, nodes, moments)
-            if len(ids):
-                half, side = _box(slot, moments)
-                nodes.radius[node], nodes.extent[node] = rounded_up(half), rounded_up(side)
-        for slot in range(1, high - low):
-            _judge(slot, slot, moments, costs[slot])
-        new = base + low - group
-        for left in range(high - low, 1, -1):
-            a, b = _cheapest(costs, left)
-            children[new - leaves, 0], children[new - leaves, 1] = slots[b], slots[a]
-            _combine(b, a, moments)
-            slots[b] = new
-            _wrap(new, children[new - leaves], b, moments, nodes, margin)
-            _queue(new, b, moments, lanes, waiting, jobs, masses)
-            waiting += 1
-            if waiting == LANES:
-                _store(waiting, lanes, jobs, masses, nodes)
-                waiting = 0
-            new += 1
-            last = left - 1
-            if a != last:
-                slots[a] = slots[last]
-                for k in range(_MEANS + 1):
-                    moments[k * MOST_LEAVES + a] = moments[k * MOST_LEAVES + last]
-                for other in range(a):
-                    costs[a, other] = costs[last, other]
-                for other in range(a + 1, last):
-                    costs[other, a] = costs[last, other]
-            _judge(b, last, moments, fresh)
-            for other in range(b):
-                costs[b, other] = fresh[other]
-            for other in range(b + 1, last):
-                costs[other, b] = fresh[other]
-    _store(waiting, lanes, jobs, masses, nodes)
-
-
-# ---------------------------------------------------------------- moments of slots
+    todo = np.empty((STACK, 3), np.int64)  # range of leaves, are both its halves held?
+    for piece in range(len(bounds) - 1):
+        todo[0, 0], todo[0, 1], todo[0, 2] = bounds[piece], bounds[piece + 1], 0
+        depth, top, taken, new = 1, 0, 0, np.int64(first[piece])
+        while depth:
+            depth -= 1
+            low, high, joins = todo[depth, 0], todo[depth, 1], todo[depth, 2]
+            middle = low + (high - low) // 2
+            if high - low > least and not joins:
+                todo[depth, 2] = 1
+                todo[depth + 1, 0], todo[depth + 1, 1], todo[depth + 1, 2] = middle, high, 0
+                todo[depth + 2, 0], todo[depth + 2, 1], todo[depth + 2, 2] = low, middle, 0
+                depth += 3
+                continue
+            count = half = 0
+            if joins:
+                top -= 2
+                for part in range(2):
+                    half = count
+                    count = restore(
+                        held_numbers, held_moments, top + part, count, numbers, moments, costs
+                    )
+            elif len(below_numbers):
+                count = restore(below_numbers, below_moments, taken, 0, numbers, moments, costs)
+                taken += 1
+            else:
+                half = count = high - low
+                for slot in range(count):
+                    node = low + slot
+                    numbers[slot] = node
+                    _enter(node, slot, means, quaternions, scales, opacities, moments)
+                    for axis in range(3):
+                        colour = colours[node - bounds[0], axis]
+                        moments[np.uint64(axis) * ROW + RED + np.uint64(slot)] = colour
+                    size, side = _box(slot, moments)
+                    radius[node], extent[node] = rounded_up(size), rounded_up(side)
+            for slot in range(half):  # leaves with all, else the one half with the other
+                judge(slot, half if joins else slot + 1, count, moments, costs)
+            find_partners(count, costs, partners)
+            target = leave if depth == 0 else keep
+            while count > target:
+                a, b = cheapest(count, partners)
+                left, right = numbers[a], numbers[b]
+                children[new - leaves, 0], children[new - leaves, 1] = left, right
+                combine(a, b, moments)
+                numbers[a], numbers[b] = new, numbers[count - 1]
+                _wrap(new, left, right, a, moments, means, radius, extent, margin)
+                _queue(new, a, moments, lanes, waiting, jobs, masses)
+                waiting += 1
+                if waiting == LANES:
+                    _store(waiting, lanes, jobs, masses, quaternions, scales, opacities)
+                    waiting = 0
+                replace(a, b, count, moments, costs, partners)
+                new += 1
+                count -= 1
+            if depth:
+                set_aside(count, numbers, moments, costs, held_numbers, held_moments, top)
+                top += 1
+            else:
+                set_aside(count, numbers, moments, costs, out_numbers, out_moments, piece)
+    _store(waiting, lanes, jobs, masses, quaternions, scales, opacities)
 
 
 @njit
-def _enter(node, slot, nodes, moments):  # type: ignore[no-untyped-def]
-    """Moments of a stored node, all but its colour."""
+def _enter(node, slot, means, quaternions, scales, opacities, moments):  # type: ignore[no-untyped-def]
+    """Moments of a leaf, all but its colour."""
     i = np.uint64(slot)
-    xx, xy, xz, yy, yz, zz = covariance(nodes.quaternions, nodes.scales, node)
-    moments[i + _XX], moments[i + _XY], moments[i + _XZ] = xx, xy, xz
-    moments[i + _YY], moments[i + _YZ], moments[i + _ZZ] = yy, yz, zz
-    moments[i + _X] = nodes.means[node, 0]
-    moments[i + _Y] = nodes.means[node, 1]
-    moments[i + _Z] = nodes.means[node, 2]
-    moments[i + _OPACITY] = nodes.opacities[node]
-    moments[i + _MASS] = moments[i + _OPACITY] * surface(nodes.scales, node)
-
-
-@njit
-def _load(i, moments):  # type: ignore[no-untyped-def]
-    """Covariance, mean, colour and mass of a slot (unsigned)."""
-    return (
-        (moments[i + _XX], moments[i + _XY], moments[i + _XZ]),
-        (moments[i + _YY], moments[i + _YZ], moments[i + _ZZ]),
-        (moments[i + _X], moments[i + _Y], moments[i + _Z]),
-        (moments[i + _RED], moments[i + _GREEN], moments[i + _BLUE]),
-        moments[i + _MASS],
-    )
-
-
-@njit
-def _pair(a, b):  # type: ignore[no-untyped-def]
-    """Share of slot a in the merge of two loaded slots, and the merge's covariance."""
-    total = a[4] + b[4]
-    p = a[4] / total if total > 0.0 else 0.5
-    q = 1.0 - p
-    r = p * q
-    dx, dy, dz = a[2][0] - b[2][0], a[2][1] - b[2][1], a[2][2] - b[2][2]
-    return (
-        p,
-        p * a[0][0] + q * b[0][0] + r * dx * dx,
-        p * a[0][1] + q * b[0][1] + r * dx * dy,
-        p * a[0][2] + q * b[0][2] + r * dx * dz,
-        p * a[1][0] + q * b[1][0] + r * dy * dy,
-        p * a[1][1] + q * b[1][1] + r * dy * dz,
-        p * a[1][2] + q * b[1][2] + r * dz * dz,
-    )
-
-
-@njit
-def _combine(slot, other, moments):  # type: ignore[no-untyped-def]
-    """Slot becomes the merge of the two."""
-    i, j = np.uint64(slot), np.uint64(other)
-    p, xx, xy, xz, yy, yz, zz = _pair(_load(i, moments), _load(j, moments))
-    for row in range(6, _MEANS):
-        k = np.uint64(row) * _ROW
-        moments[i + k] = p * moments[i + k] + (1.0 - p) * moments[j + k]
-    moments[i + _XX], moments[i + _XY], moments[i + _XZ] = xx, xy, xz
-    moments[i + _YY], moments[i + _YZ], moments[i + _ZZ] = yy, yz, zz
-    moments[i + _MASS] += moments[j + _MASS]
-
-
-@njit
-def _judge(slot, end, moments, costs):  # type: ignore[no-untyped-def]
-    """costs[i] of merging a slot with slot i, for all i before ``end``.
-
-    The sum of the covariance's principal minors, times the penalty for unlike colours.
-    """
-    a = _load(np.uint64(slot), moments)
-    for other in range(np.uint64(end)):
-        b = _load(other, moments)
-        _, xx, xy, xz, yy, yz, zz = _pair(a, b)
-        red, green, blue = a[3][0] - b[3][0], a[3][1] - b[3][1], a[3][2] - b[3][2]
-        unlike = 1.0 + (red * red + green * green + blue * blue)
-        minors = (xx * yy - xy * xy) + (xx * zz - xz * xz) + (yy * zz - yz * yz)
-        costs[other] = minors * (unlike * unlike)
-
-
-@njit
-def _cheapest(costs, count):  # type: ignore[no-untyped-def]
-    """Two slots a > b of the least cost."""
-    a, b = 1, 0
-    least = costs[1, 0]
-    for i in range(2, count):
-        row = costs[i]
-        for j in range(i):
-            if row[j] < least:
-                least, a, b = row[j], i, j
-    return a, b
-
-
-# ---------------------------------------------------------------- finished nodes
+    xx, xy, xz, yy, yz, zz = covariance(quaternions, scales, node)
+    moments[i + XX], moments[i + XY], moments[i + XZ] = xx, xy, xz
+    moments[i + YY], moments[i + YZ], moments[i + ZZ] = yy, yz, zz
+    moments[i + X], moments[i + Y], moments[i + Z] = means[node, 0], means[node, 1], means[node, 2]
+    moments[i + OPACITY] = opacities[node]
+    moments[i + MASS] = moments[i + OPACITY] * surface(scales, node)
 
 
 @njit
 def _box(slot, moments):  # type: ignore[no-untyped-def]
     """Half diagonal and longest side of the 3-sigma box."""
     i = np.uint64(slot)
-    xx, yy, zz = moments[i + _XX], moments[i + _YY], moments[i + _ZZ]
+    xx, yy, zz = moments[i + XX], moments[i + YY], moments[i + ZZ]
     return 3.0 * math.sqrt(xx + yy + zz), 6.0 * math.sqrt(max(xx, yy, zz))
 
 
 @njit
-def _wrap(node, pair, slot, moments, nodes, margin):  # type: ignore[no-untyped-def]
+def _wrap(node, left, right, slot, moments, means, radius, extent, margin):  # type: ignore[no-untyped-def]
     """Mean, R and e of a node: around its own box and its children's spheres."""
     for axis in range(3):
-        nodes.means[node, axis] = np.float32(moments[(6 + axis) * MOST_LEAVES + slot])
+        means[node, axis] = np.float32(moments[(6 + axis) * MOST_SLOTS + slot])
     half, side = _box(slot, moments)
-    for child in pair:
+    for child in (left, right):
         gap = 0.0
         for axis in range(3):
-            d = np.float64(nodes.means[child, axis]) - np.float64(nodes.means[node, axis])
+            d = np.float64(means[child, axis]) - np.float64(means[node, axis])
             gap += d * d
-        half = max(half, (np.float64(nodes.radius[child]) + math.sqrt(gap)) * margin)
-        side = max(side, np.float64(nodes.extent[child]) * margin)
-    nodes.radius[node] = rounded_up(half)
-    nodes.extent[node] = rounded_up(side)
+        half = max(half, (np.float64(radius[child]) + math.sqrt(gap)) * margin)
+        side = max(side, np.float64(extent[child]) * margin)
+    radius[node] = rounded_up(half)
+    extent[node] = rounded_up(side)
 
 
 @njit
@@ -313,19 +291,17 @@ def _queue(node, slot, moments, lanes, lane, jobs, masses):  # type: ignore[no-u
     """Leave the axes of a node for `_store`, many at a time."""
     jobs[lane] = node
     for k in range(6):
-        lanes[k * LANES + lane] = moments[k * MOST_LEAVES + slot]
-    masses[0, lane] = moments[np.uint64(slot) + _MASS]
-    masses[1, lane] = moments[np.uint64(slot) + _OPACITY]
+        lanes[k * LANES + lane] = moments[k * MOST_SLOTS + slot]
+    masses[0, lane] = moments[np.uint64(slot) + MASS]
+    masses[1, lane] = moments[np.uint64(slot) + OPACITY]
 
 
 @njit
-def _store(count, lanes, jobs, masses, nodes):  # type: ignore[no-untyped-def]
+def _store(count, lanes, jobs, masses, quaternions, scales, opacities):  # type: ignore[no-untyped-def]
     """Rotations, scales and opacities of the nodes that wait."""
     find_axes(lanes, count)
     for lane in range(count):
-        node = jobs[lane]
-        area = store_axes(lanes, lane, node, nodes.quaternions, nodes.scales)
-        if masses[0, lane] > 0.0 and area > 0.0:
-            nodes.opacities[node] = np.float32(masses[0, lane] / area)
-        else:
-            nodes.opacities[node] = np.float32(masses[1, lane])
+        node, mass = jobs[lane], masses[0, lane]
+        area = store_axes(lanes, lane, node, quaternions, scales)
+        kept = mass > 0.0 and area > 0.0
+        opacities[node] = np.float32(mass / area if kept else masses[1, lane])

@@ -9,9 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gaussians.scene import FIELDS, Scene
+from gaussians.scene import FIELDS, Scene, concatenate
+from lod_cloud.columns import ColumnReader, ColumnWriter
 from lod_cloud.lod_tree import Float32, Int32, LodTree
 from lod_cloud.protocol import RemoteProtocolError
+
+_LARGEST = 2**31 - 1
 
 
 @dataclass(frozen=True)
@@ -36,16 +39,41 @@ class NodeRecords:
         radius, extent = tree.radius[ids] * inner, tree.extent[ids] * inner
         return cls(ids, tree.parent[ids], counts, radius, extent, tree.gaussians.take(ids))
 
-    def take(self, rows: NDArray[np.bool_]) -> NodeRecords:
-        """Only the marked rows."""
+    def take(self, rows: NDArray[np.integer]) -> NodeRecords:
+        """These rows."""
         return NodeRecords(
             self.ids[rows],
             self.parents[rows],
             self.child_counts[rows],
             self.radius[rows],
             self.extent[rows],
-            self.gaussians.take(np.flatnonzero(rows)),
+            self.gaussians.take(rows),
         )
+
+    def joined(self, others: NodeRecords) -> NodeRecords:
+        """Both, in the order of their ids."""
+        order = np.argsort(np.concatenate([self.ids, others.ids]))
+
+        def both(name: str) -> NDArray[Any]:
+            return np.asarray(np.concatenate([getattr(self, name), getattr(others, name)])[order])
+
+        return NodeRecords(
+            both("ids"),
+            both("parents"),
+            both("child_counts"),
+            both("radius"),
+            both("extent"),
+            concatenate([self.gaussians, others.gaussians]).take(order),
+        )
+
+    def write_places(self, writer: ColumnWriter, *, places: bool) -> None:
+        """How many nodes, and with ``places`` which, and their parents."""
+        writer.begin("counts")
+        writer.varint(len(self))
+        if places:
+            writer.begin("places")
+            writer.ascending(self.ids)
+            writer.integers(np.diff(self.parents.astype(np.int64), prepend=-1))
 
     def check(self) -> NodeRecords:
         """Return self, or raise RemoteProtocolError unless ids and parents are those of a tree."""
@@ -56,11 +84,37 @@ class NodeRecords:
             raise RemoteProtocolError("a parent must have a smaller id than its child")
         return self
 
-    def float32_rows(self, rows: NDArray[np.integer]) -> Float32:
-        """[rows, `row_width`] everything but the place in the tree, exact."""
+    def float32_rows(self, rows: NDArray[np.integer], coefficients: int | None = None) -> Float32:
+        """[rows, `row_width`] everything but the place in the tree, exact; of the harmonics only
+        so many coefficients, if that is said.
+        """
         gaussians = self.gaussians.take(rows)
         spheres = np.stack([self.radius[rows], self.extent[rows]], axis=1)
-        return np.hstack([spheres, *(_flat(getattr(gaussians, f)) for f in FIELDS)])
+        parts = [_flat(getattr(gaussians, f)) for f in FIELDS[:-1]]
+        return np.hstack([spheres, *parts, _flat(gaussians.sh[:, :coefficients])])
+
+
+def read_places(reader: ColumnReader, places: tuple[Int32, Int32] | None) -> tuple[Int32, Int32]:
+    """Ids and parents of the nodes in a payload; ``places`` if they are known."""
+    count = reader.varint()
+    reader.expect(count)  # at least a byte per node
+    if places is None:
+        ids = reader.ascending(count)
+        parents = np.cumsum(reader.integers(count)) - 1
+        if count and max(ids[-1], parents[-1]) > _LARGEST:
+            raise RemoteProtocolError(f"node ids must be at most {_LARGEST}")
+        return ids.astype(np.int32), parents.astype(np.int32)
+    if len(places[0]) != count:
+        raise RemoteProtocolError(f"payload must have {len(places[0])} nodes, not {count}")
+    return places
+
+
+def read_child_counts(reader: ColumnReader, count: int) -> Int32:
+    """[count] numbers of children."""
+    counts = reader.integers(count)
+    if (counts > _LARGEST).any():
+        raise RemoteProtocolError(f"a node must have at most {_LARGEST} children")
+    return counts.astype(np.int32)
 
 
 def row_width(sh_degree: int) -> int:
@@ -72,7 +126,7 @@ def with_rows(
     structure: tuple[Int32, Int32, Int32],
     spheres: Float32,
     gaussians: Scene,
-    rows: Int32,
+    rows: NDArray[np.integer],
     values: Float32,
 ) -> NodeRecords:
     """Records with ``values`` [rows, width] at ``rows`` and the others, in order, from the rest.

@@ -1,9 +1,8 @@
 """Breadth-first numbers for the nodes of an unfinished tree, with or without small steps.
 
 *Irregular fan-out*: an interior node whose extent e is more than ``ratio`` times that of its
-nearest kept ancestor is left out, and that ancestor takes its children. R and e of the kept nodes
-stay those of the binary tree, which bound their new children too: sums of gaps along dropped
-nodes are no shorter than the direct one.
+nearest kept ancestor is left out, and that ancestor takes its children (`lod_cloud.spheres` then
+fits R and e to those).
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from numba import njit
 from lod_cloud.lod_tree import Float32, Int32
 
 _HUGE = np.float32(np.inf)
-_MOST_LEVELS = 256  # 31 of median splits and those of one group
+_MOST_LEVELS = 1024  # 31 of median splits, each with at most 32 merges on a path
 
 
 @dataclass(frozen=True)

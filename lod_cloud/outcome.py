@@ -6,9 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lod_cloud.cut import without
 from lod_cloud.events import Events
+from lod_cloud.families import Families
 from lod_cloud.lod_tree import Int32
 from lod_cloud.management_table import ManagementTable
+from lod_cloud.node_records import NodeRecords
 from lod_cloud.protocol import RemoteProtocolError
 from lod_cloud.subgraph import LocalSubgraph
 
@@ -19,13 +22,17 @@ class Outcome:
 
     entered: Int32  # in the cut now, ascending
     left: Int32  # in the cut before, ascending
-    needed: Int32  # of ``entered``: not held
-    needed_parents: Int32
+    sent: Int32  # of ``entered``: not held, and not merged from what is held; ascending
+    sent_parents: Int32
+    references: Int32  # for each of ``sent`` a node held, which its coding may refer to
+    merged: NodeRecords  # of ``entered``: not held, but their children
 
 
-def outcome(events: Events, table: ManagementTable, held: LocalSubgraph) -> Outcome:
-    """Nodes from events, by what a client holds. Raises RemoteProtocolError for events that do not
-    fit it.
+def outcome(
+    events: Events, table: ManagementTable, held: LocalSubgraph, *, merges: bool
+) -> Outcome:
+    """Nodes from events, by what a client holds, which merges collapsed nodes itself if ``merges``.
+    Raises RemoteProtocolError for events that do not fit it.
     """
     for ids in (events.expanded, events.tops, events.inner):
         if len(ids) and ids[-1] >= table.nodes:
@@ -43,20 +50,45 @@ def outcome(events: Events, table: ManagementTable, held: LocalSubgraph) -> Outc
     offsets = np.arange(total) - np.repeat(begins, counts)
     nodes = (np.repeat(events.first_children, counts) + offsets).astype(np.int32)
     parents = np.repeat(events.expanded, counts)
+    if (np.diff(nodes) <= 0).any():
+        raise RemoteProtocolError("children of different nodes must differ")
     drawn = ~np.isin(nodes, events.expanded)
-    collapsed = np.union1d(events.tops, events.inner).astype(np.int32)
-    below = held.children(collapsed)
-    left = np.union1d(events.expanded[known], below[table.in_cut(below)]).astype(np.int32)
+    families = Families.of(events, table, held)
+    left = np.union1d(events.expanded[known], families.drawn).astype(np.int32)
     new_tops = ~table.holds(events.tops)
-    if np.count_nonzero(new_tops) != len(events.top_parents):
-        raise RemoteProtocolError("a collapsed node must be held or tell its parent")
-    top_parents = np.full(len(events.tops), -1, np.int32)
-    top_parents[new_tops] = events.top_parents
+    wanted, wanted_parents = events.tops[new_tops], events.top_parents[new_tops]
     entered = np.concatenate([nodes[drawn], events.tops])
-    above = np.concatenate([parents[drawn], top_parents])
-    order = np.argsort(entered)
-    entered, above = entered[order], above[order]
-    if len(entered) and not 0 <= entered[0] <= entered[-1] < table.nodes:
+    if len(entered) and not 0 <= entered.min() <= entered.max() < table.nodes:
         raise RemoteProtocolError(f"node ids must be below {table.nodes}")
-    new = ~table.holds(entered)
-    return Outcome(entered, left, entered[new], above[new])
+    merged = without(wanted, events.unmerged) if merges else wanted[:0]
+    apart = np.isin(wanted, merged, invert=True)
+    fresh = nodes[drawn][~table.holds(nodes[drawn])]
+    sent = np.concatenate([fresh, wanted[apart]])
+    above = np.concatenate([_parents(fresh, nodes, parents), wanted_parents[apart]])
+    near = np.concatenate(
+        [_ancestors(fresh, nodes, parents, table), families.first_held(wanted[apart], table)]
+    )
+    order = np.argsort(sent)
+    return Outcome(
+        np.sort(entered),
+        left,
+        sent[order],
+        above[order],
+        near[order],
+        families.merged(merged, wanted_parents[~apart], held),
+    )
+
+
+def _parents(ids: Int32, nodes: Int32, parents: Int32) -> Int32:
+    """Parents of some of ``nodes`` (ascending)."""
+    return parents[np.searchsorted(nodes, ids)]
+
+
+def _ancestors(ids: Int32, nodes: Int32, parents: Int32, table: ManagementTable) -> Int32:
+    """The nearest ancestor held of each of ``ids``, which are some of ``nodes``."""
+    near = _parents(ids, nodes, parents)
+    while not (there := table.holds(near)).all():
+        if not np.isin(near[~there], nodes).all():
+            raise RemoteProtocolError("an expanded node must be below a node that is held")
+        near[~there] = _parents(near[~there], nodes, parents)
+    return near

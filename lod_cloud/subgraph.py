@@ -89,6 +89,27 @@ class LocalSubgraph:
         offsets = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
         return self.ids[np.repeat(begins, counts) + offsets]
 
+    def parents(self, ids: Int32) -> Int32:
+        """Parents of nodes held."""
+        return self._parents[np.searchsorted(self.ids, ids)]
+
+    def means(self, ids: Int32) -> Float32:
+        """[N, 3] means of nodes held, in any order."""
+        return self._spheres[np.searchsorted(self.ids, ids), :3]
+
+    def records(self, ids: Int32) -> NodeRecords:
+        """Nodes held (ascending) as they came, copied."""
+        rows = np.searchsorted(self.ids, ids).astype(np.int32)
+        spheres = self._spheres[rows]
+        return NodeRecords(
+            ids,
+            self._parents[rows],
+            self._child_counts[rows],
+            np.ascontiguousarray(spheres[:, 3]),
+            np.ascontiguousarray(spheres[:, 4]),
+            self.gaussians(rows),
+        )
+
     def choose(self, in_cut: NDArray[np.bool_], request: SearchRequest) -> Choice:
         """The finest complete set from ``request``'s position, starting from the cut (rows marked).
 

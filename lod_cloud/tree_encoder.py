@@ -2,36 +2,95 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
+from numpy.typing import NDArray
 
 from gaussians.errors import InputError
-from lod_cloud.codec import PaperCodec
+from lod_cloud.child_numbers import ChildNumbers
+from lod_cloud.codec import Codec, Encoded, References
+from lod_cloud.cut import without
+from lod_cloud.events import Events
 from lod_cloud.lod_tree import Int32, LodTree
+from lod_cloud.management_table import ManagementTable
 from lod_cloud.node_records import NodeRecords
+from lod_cloud.siblings import faithful
+
+_BLOCK = 1 << 14  # nodes whose words are looked for at a time
 
 
 class TreeEncoder:
     """Codes nodes of one tree, looking for a node's codebook words only once. Serves many
     sessions.
+
+    Memory: words and two flags per node of the tree, of which the system provides only the pages
+    with nodes that were coded (4 B per node with two stages of up to 256 words, 4 with one of
+    4096).
     """
 
-    def __init__(self, tree: LodTree, codec: PaperCodec) -> None:
+    def __init__(self, tree: LodTree, codec: Codec) -> None:
         if codec.sh_degree != tree.sh_degree:
             raise InputError(
                 f"codec must be trained for SH degree {tree.sh_degree}, not {codec.sh_degree}"
             )
         self.tree, self.codec = tree, codec
-        stages = len(codec.codebook.stages) if codec.codebook else 0
-        self._words = np.zeros((len(tree), stages), np.uint16)
+        self.child_numbers = ChildNumbers.of(tree)
+        book = codec.codebook
+        stages, kind = (len(book.stages), book.index_type) if book else (0, np.uint8)
+        self._words: NDArray[np.unsignedinteger] = np.zeros((len(tree), stages), kind)
         self._near = np.zeros(len(tree), np.bool_)
         self._known = np.zeros(len(tree), np.bool_)
 
-    def encode(self, ids: Int32, *, places: bool = True) -> tuple[bytes, int]:
-        """Payload of the nodes ``ids`` (ascending), and how many of them are escapes; see
-        `PaperCodec.encode`.
+    def encode(self, ids: Int32) -> Encoded:
+        """The nodes ``ids`` (ascending) for a client of which nothing is known; see
+        `Codec.encode`.
         """
+        return self._coded(ids, None, places=True)
+
+    def encode_step(self, events: Events, needed: Int32, table: ManagementTable) -> Encoded:
+        """What a client with this table must be sent to follow ``events``, which make it hold
+        ``needed`` (ascending), and the events as they are to be told.
+        """
+        unmerged = self._unmerged(events, needed) if self.codec.merges else events.tops[:0]
+        sent = needed
+        if self.codec.merges:
+            sent = without(needed, without(events.tops, unmerged))
+        references = self._references(sent, events, table) if self.codec.relative else None
+        coded = self._coded(sent, references, places=False)
+        events = dataclasses.replace(events, unmerged=unmerged)
+        return dataclasses.replace(coded, merged=len(needed) - len(sent), events=events)
+
+    def _coded(self, ids: Int32, references: References | None, *, places: bool) -> Encoded:
         fresh = ids[~self._known[ids]]
-        self._words[fresh], self._near[fresh] = self.codec.assign_words(self.tree, fresh)
-        self._known[fresh] = True
+        for begin in range(0, len(fresh), _BLOCK):
+            block = fresh[begin : begin + _BLOCK]
+            self._words[block], self._near[block] = self.codec.assign_words(self.tree, block)
+            self._known[block] = True
         nodes = NodeRecords.of(self.tree, ids)
-        return self.codec.encode(nodes, self._words[ids], self._near[ids], places=places)
+        return self.codec.encode(
+            nodes, self._words[ids], self._near[ids], places=places, references=references
+        )
+
+    def _unmerged(self, events: Events, needed: Int32) -> Int32:
+        """Tops that the client needs and cannot merge from what it holds."""
+        collapsed = np.union1d(events.tops, events.inner).astype(np.int32)
+        bad = collapsed[~faithful(self.tree, collapsed)]
+        above = np.isin(bad, events.inner)
+        while above.any():
+            bad = np.unique(np.concatenate([bad[~above], self.tree.parent[bad[above]]]))
+            above = np.isin(bad, events.inner)
+        return np.intersect1d(bad, needed, assume_unique=True)
+
+    def _references(self, sent: Int32, events: Events, table: ManagementTable) -> References:
+        """For each node one that the client holds: the nearest ancestor, and for a node that takes
+        the place of its descendants the first of these.
+        """
+        tree = self.tree
+        top = np.isin(sent, events.tops, assume_unique=True)
+        held = np.where(top, tree.first_child[sent], tree.parent[sent])
+        while not (there := table.holds(held)).all():
+            held[~there & top] = tree.first_child[held[~there & top]]
+            held[~there & ~top] = tree.parent[held[~there & ~top]]
+        scene = tree.gaussians
+        return References(scene.means[held], scene.scales[held].max(axis=1, initial=0))

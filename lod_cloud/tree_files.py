@@ -5,6 +5,9 @@ files are refused) and the checksum of tree.json itself. An array's own checksum
 the file is small, or when its modification time is no longer the one all files of a tree share
 since they were written (it was touched, altered, or copied without ``cp -p``). An undisturbed
 large tree is therefore opened without reading it; `verify_tree` reads every byte.
+
+Beside the tree's own arrays a directory holds those that searches read (`lod_cloud.search_arrays`):
+they follow from the others, and are there to be mapped instead of made. `verify_tree` compares.
 """
 
 from __future__ import annotations
@@ -30,9 +33,17 @@ from gaussians.parallel import threads
 from gaussians.scene import FIELDS, Scene
 from lod_cloud.array_file import ArrayFile
 from lod_cloud.lod_tree import ARRAYS, LodTree, Point, TreeMetadata
+from lod_cloud.search_arrays import SearchArrays
+from lod_cloud.search_files import (
+    SEARCH_FILES,
+    compare_search_arrays,
+    search_array_shapes,
+    write_search_arrays,
+)
 
 FORMAT = "nebula LoD tree"
-VERSION = 1
+VERSION = 2
+_READABLE = (1, 2)  # 1 had no search arrays
 _DESCRIPTION = "tree.json"
 _READ_BYTES = 1 << 22
 _ALWAYS_CHECKED_BYTES = 1 << 24
@@ -72,21 +83,33 @@ def load_tree(directory: str | os.PathLike[str]) -> LodTree:
 def verify_tree(directory: str | os.PathLike[str]) -> LodTree:
     """`load_tree`, after every byte was compared with its checksum and every rule of `LodTree`."""
     source = Path(directory)
-    return _load(source, thorough=True).validate(str(source))
+    tree = _load(source, thorough=True).validate(str(source))
+    compare_search_arrays(source, tree)
+    return tree
 
 
 def _load(source: Path, *, thorough: bool) -> LodTree:
     description = _read_description(source)
     stamp = (source / _DESCRIPTION).stat().st_mtime_ns
     wanted = {*ARRAYS, *FIELDS}
+    if description["version"] > 1:
+        wanted |= {*SEARCH_FILES}
     if set(description["arrays"]) != wanted:
         raise InputError(f"{source}: {_DESCRIPTION} must list the arrays {sorted(wanted)}")
-    arrays = {
+    arrays: dict[str, Any] = {
         name: _read_array(source, name, entry, None if thorough else stamp)
         for name, entry in description["arrays"].items()
     }
+    derived = None
+    if description["version"] > 1:
+        derived = SearchArrays(*(arrays.pop(name) for name in SEARCH_FILES))
     scene = Scene(*(arrays.pop(name) for name in FIELDS))
-    tree = LodTree(gaussians=scene, metadata=_metadata(description["metadata"]), **arrays)
+    tree = LodTree(
+        gaussians=scene,
+        metadata=_metadata(description["metadata"]),
+        search_arrays=derived,
+        **arrays,
+    )
     counts = {"nodes": len(tree), "levels": tree.levels, "sh_degree": tree.sh_degree}
     said = {name: description["counts"][name] for name in counts}
     if counts != said or any(len(array) != len(tree) for array in _per_node(tree)):
@@ -139,12 +162,18 @@ class TreeWriter:
 
     def tree(self) -> LodTree:
         """What was written so far, memory-mapped; every array must be there."""
-        arrays = {name: file.mapped() for name, file in self._files.items()}
+        arrays: dict[str, Any] = {name: file.mapped() for name, file in self._files.items()}
         scene = Scene(*(arrays.pop(name) for name in FIELDS))
         return LodTree(gaussians=scene, metadata=self._metadata, **arrays)
 
     def finish(self) -> float:
-        """Checksums and tree.json; returns the seconds of everything that was disk work."""
+        """Search arrays, checksums, tree.json; returns the seconds of everything that was disk
+        work.
+        """
+        nodes = self._counts["nodes"]
+        for name, shape in zip(SEARCH_FILES, search_array_shapes(nodes), strict=True):
+            self.array(name, shape, np.float32)
+        write_search_arrays(self._files, nodes)
         begin = time.perf_counter()
         seconds = sum(file.seconds for file in self._files.values()) / threads()
         for file in self._files.values():
@@ -242,8 +271,9 @@ def _read_description(source: Path) -> dict[str, Any]:
         raise InputError(f"{path}: must be JSON: {error}") from error
     if not isinstance(description, dict) or description.get("format") != FORMAT:
         raise InputError(f"{path}: format must be {FORMAT!r}")
-    if description.get("version") != VERSION:
-        raise InputError(f"{path}: version must be {VERSION}, not {description.get('version')}")
+    if description.get("version") not in _READABLE:
+        readable = " or ".join(map(str, _READABLE))
+        raise InputError(f"{path}: version must be {readable}, not {description.get('version')}")
     if description.get("sha256") != _digest(description):
         raise InputError(f"{path}: checksum must match; the file was altered")
     return description

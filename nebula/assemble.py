@@ -33,12 +33,12 @@ def by_eye(pairs: Sequence[tuple[float, float]]) -> dict[str, float]:
 def lod(tree: LodTree, session: Session, tau_px: float, build_ms: float) -> dict[str, Any]:
     """Tree and searches."""
     searches = session.searches
-    overlaps = [1.0 - s.added / s.cut_size for s in searches[1:]]
+    overlaps = [1.0 - s.found / s.cut_size for s in searches[1:]]
     return {
         "nodes": len(tree),
         "levels": tree.levels,
         "tau_px": tau_px,
-        "method": "flat",
+        "method": session.method,
         "search_every_frames": session.cloud.table.frames_per_search,
         "cut_sizes": [s.cut_size for s in searches],
         "cut_size_mean": mean(s.cut_size for s in searches),
@@ -68,6 +68,22 @@ def stream(
         "initial_ms": start.initial_ms,
         "held_nodes_max": max(r.held_splats for r in records),
         "reuse_window_searches": window // session.cloud.table.frames_per_search,
+        "pacing": _pacing(session),
+    }
+
+
+def _pacing(session: Session) -> dict[str, Any]:
+    """What the byte budget did to each message; nothing without one."""
+    if session.budget_bytes is None:
+        return {}
+    searches = session.searches
+    errors = [s.pending_error_px for s in searches]
+    return {
+        "budget_bytes": session.budget_bytes,
+        "pending_nodes": [s.pending for s in searches],
+        "pending_error_px": [error if math.isfinite(error) else None for error in errors],
+        "deferred_bytes": [s.deferred_bytes for s in searches],
+        "tau_px": [s.tau_px for s in searches],
     }
 
 

@@ -25,6 +25,7 @@ from lod_cloud import (
     build_tree_files,
     load_tree,
 )
+from nebula.imported_tree import build_imported
 from nebula.options import BuildTreeOptions, TiledTree
 from nebula.output import CommandResult
 from nebula.progress import progress
@@ -49,10 +50,13 @@ class _Built:
 def run(options: BuildTreeOptions) -> CommandResult:
     """Build, prove nesting on every edge, and save; nothing is kept when a step fails."""
     rules = BuildOptions(options.pair_within, options.fan_out_ratio)
-    if options.tiled is None:
-        built = _of_scene(options, rules)
-    else:
+    if options.tiled is not None:
         built = _of_tiles(options.tiled, options, rules)
+    elif options.structure != "merged":
+        name, read_s, times = build_imported(options, rules)
+        built = _Built(name, read_s, 0.0, times)
+    else:
+        built = _of_scene(options, rules)
     tree = load_tree(options.out)
     leaves = int(np.count_nonzero(tree.leaf_id >= 0))
     times = built.times

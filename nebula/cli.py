@@ -17,17 +17,21 @@ import click
 from gaussians.errors import InputError
 from nebula.cli_options import (
     COUNT,
+    EXACT_METHODS,
     METHODS,
     NOT_NEGATIVE,
     POSITIVE,
     SEARCH_METHODS,
+    SHARE,
     Finite,
     accelerator_option,
     baseline_option,
     display_options,
+    hysteresis_option,
     json_option,
     method_option,
     out_option,
+    paced_option,
     scene_options,
     seed_option,
     tau_option,
@@ -69,6 +73,7 @@ def cli() -> None:
 @click.option("--trace-fov", is_flag=True, help="Off-axis windows by the recording's half-angles.")
 @click.option("--rate-mbps", type=POSITIVE, default=100.0, show_default=True, help="Link rate.")
 @click.option("--latency-ms", type=NOT_NEGATIVE, default=20.0, show_default=True, help="One way.")
+@paced_option
 @threads_option
 @out_option("out/simulate")
 @click.option("--html/--no-html", default=True, show_default=True, help="Write report.html too.")
@@ -205,7 +210,7 @@ def convert(source: str, up: str | None, json_target: str | None, **values: Any)
     type=click.IntRange(1, 64),
     default=16,
     show_default=True,
-    help="Cheapest pairs first in groups of so many leaves; 1: medians to the end.",
+    help="The cheapest pair of so many neighbours merges first; 1: the halves of a split.",
 )
 @click.option(
     "--fan-out-ratio",
@@ -213,6 +218,13 @@ def convert(source: str, up: str | None, json_target: str | None, **values: Any)
     default=1.0,
     show_default=True,
     help="Leave out nodes above this share of their parent's size, such as 0.7.",
+)
+@click.option(
+    "--structure",
+    type=click.Choice(["merged", "blocks", "instances", "octree"]),
+    default="merged",
+    show_default=True,
+    help="Pairs merged; levels of a lod-meta.json; a subtree per copy of a layout; voxels.",
 )
 @seed_option
 @threads_option
@@ -229,6 +241,7 @@ def build_tree(
     if tiled is not None:
         leaves = values.pop("city_leaves")
         idle = [key for key in (*_SCENE_KEYS, "config") if values.get(key) is not None]
+        idle += ["structure"] if values["structure"] != "merged" else []
         if idle:
             names = ", ".join(f"--{key.replace('_', '-')}" for key in idle)
             raise InputError(f"--tiled brings its own scene; {names}: not of use")
@@ -246,13 +259,7 @@ def build_tree(
 @tau_option
 @click.option("--method", type=SEARCH_METHODS, default="auto", show_default=True, metavar="NAME")
 @click.option("--compare", is_flag=True, help="All methods and baseline rules, one after another.")
-@click.option(
-    "--hysteresis",
-    type=Finite(min=0, max=0.05),
-    default=0.0,
-    show_default=True,
-    help="Share of its switching distance by which a node stays refined.",
-)
+@hysteresis_option(0.0)
 @threads_option
 @json_option
 def search(json_target: str | None, **values: Any) -> None:
@@ -260,6 +267,46 @@ def search(json_target: str | None, **values: Any) -> None:
     from nebula.options import SearchOptions
 
     _execute("search", SearchOptions, values, json_target)
+
+
+@cli.command()
+@click.option("--tree", type=click.Path(path_type=Path), metavar="DIR", help="Instead of a scene.")
+@scene_options
+@seed_option
+@view_options
+@trace_option
+@click.option("--frames", type=COUNT, help="Of the trace.  [default: enough for 450 searches]")
+@click.option("--every", "search_every", type=COUNT, default=4, show_default=True, help="Frames.")
+@tau_option
+@click.option("--method", type=EXACT_METHODS, default="auto", show_default=True, metavar="NAME")
+@hysteresis_option(0.02)
+@click.option(
+    "--codec",
+    type=click.Choice(["paper", "compact"]),
+    default="compact",
+    show_default=True,
+    help="Coding of the nodes.",
+)
+@click.option("--rate-mbps", type=POSITIVE, default=100.0, show_default=True, help="Link rate.")
+@click.option("--latency-ms", type=NOT_NEGATIVE, default=5.0, show_default=True, help="One way.")
+@paced_option
+@click.option("--loss", type=SHARE, default=0.0, help="Share of the messages lost, either way.")
+@click.option("--reorder", type=SHARE, default=0.0, help="Share that arrive one search later.")
+@click.option("--corruption", type=SHARE, default=0.0, help="Share with a bit flipped.")
+@threads_option
+@json_option
+def stream(tree: Path | None, json_target: str | None, **values: Any) -> None:
+    """Play a head trace through cloud, link and client, without rendering.
+
+    The scene's tree is built first, unless --tree names a stored one.
+    """
+    from nebula.options import StreamOptions
+
+    idle = [key for key in _TREE_KEYS if tree is not None and values.get(key) is not None]
+    if idle:
+        names = ", ".join(f"--{key.replace('_', '-')}" for key in idle)
+        raise InputError(f"--tree brings its own scene; {names}: not of use")
+    _execute("stream", StreamOptions, values | {"tree": tree}, json_target)
 
 
 @cli.command()
@@ -294,13 +341,19 @@ def energy(json_target: str | None, **values: Any) -> None:
 
 
 @cli.command(
-    epilog="\b\nFigures:\n" + "\n".join(f"  {n:<18} {about}" for n, (_, about) in FIGURES.items())
+    epilog="\b\nFigures:\n" + "\n".join(f"  {n:<19} {kind.about}" for n, kind in FIGURES.items())
 )
 @click.argument("name", metavar="NAME")
 @scene_options
 @seed_option
 @view_options
 @baseline_option
+@click.option("--tree", type=click.Path(path_type=Path), metavar="DIR", help="Instead of a scene.")
+@trace_option
+@click.option("--tau", "tau_px", type=NOT_NEGATIVE, help="LoD, px of the display.  [default: 6]")
+@click.option("--every", "search_every", type=COUNT, help="Frames per search.  [default: 4]")
+@click.option("--frames", type=COUNT, help="Of every trace.  [default: the figure's own]")
+@click.option("--shrink", type=COUNT, help="Pictures of 1/N of the display.  [default: 4]")
 @threads_option
 @out_option(None)
 @json_option
@@ -309,8 +362,9 @@ def figure(
 ) -> None:
     """Measure a figure; write NAME.json, NAME.csv and NAME.png.
 
-    Without a scene it measures its own few; real ones are looked for in $NEBULA_DATA. The display
-    is then the prototype's 2064 x 2208 pixels, unless one is given.
+    Without a scene it measures its own few; real ones are looked for in $NEBULA_DATA. Figures of
+    searches and streams take a tree of build-tree, or a scene, or make a dense city. The display
+    is the prototype's 2064 x 2208 pixels, unless another is given.
     """
     from nebula.options import FigureOptions
 
@@ -320,6 +374,7 @@ def figure(
 
 
 _VIEW_KEYS = ("view", "fov_deg", "width", "height", "display")
+_TREE_KEYS = ("scene", "city_leaves", "level", "up", "units_per_metre", "config")
 _SCENE_KEYS = (
     *("scene", "city_leaves", "level", "up", "units_per_metre", "near_m", "trace"),
     *_VIEW_KEYS,

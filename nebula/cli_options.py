@@ -29,12 +29,10 @@ LEAVES = click.IntRange(1_000, 20_000_000)
 PIXELS = click.IntRange(1, 16_384)
 FOV_DEG = Finite(min=1, max=170)
 METHODS = click.Choice(["exact", "paper", "independent"])
-SEARCH_METHODS = click.Choice(
-    [
-        *("flat", "depth_first", "streaming", "temporal", "validity", "wheel", "auto"),
-        *("octree_gs", "city_gaussian"),
-    ]
-)
+SHARE = Finite(min=0, max=1)
+_EXACT = ("flat", "depth_first", "streaming", "temporal", "validity", "wheel", "auto")
+EXACT_METHODS = click.Choice(_EXACT)
+SEARCH_METHODS = click.Choice([*_EXACT, "octree_gs", "city_gaussian"])
 UP_AXES = click.Choice(["+x", "-x", "+y", "-y", "+z", "-z"])
 
 
@@ -96,6 +94,11 @@ trace_options = options(
     click.option("--search-every", type=COUNT, default=4, show_default=True, help="Frames."),
     tau_option,
 )
+paced_option = click.option(
+    "--paced",
+    is_flag=True,
+    help="Messages within what the link carries between two searches, coarse to fine.",
+)
 method_option = click.option("--method", type=METHODS, default="exact", show_default=True)
 accelerator_option = click.option(
     "--accelerator",
@@ -122,4 +125,15 @@ def out_option(default: str | None) -> Callable[[Function], Function]:
         metavar="DIR",
         help="Files of the same name are replaced, others stay.",
         **given,
+    )
+
+
+def hysteresis_option(default: float) -> Callable[[Function], Function]:
+    """``--hysteresis H``."""
+    return click.option(
+        "--hysteresis",
+        type=Finite(min=0, max=0.05),
+        default=default,
+        show_default=True,
+        help="Share of its switching distance by which a node stays refined.",
     )

@@ -11,9 +11,9 @@ from nebula.output import CommandResult, OutputDirectory
 def run(options: FigureOptions) -> CommandResult:
     """Write NAME.json, NAME.csv and NAME.png into the output directory.
 
-    Raises InputError for an unknown name, and without matplotlib.
+    Raises InputError for an unknown name, an option without use for it, and without matplotlib.
     """
-    module = figure_module(options.name)
+    module = figure_module(options)
     require_matplotlib()
     with OutputDirectory(options.out) as out:
         figure = module.make(options)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,6 +28,7 @@ _OUTLIER_BOXES = 10.0  # an outlier lies outside the 1-99 % box blown up by this
 _NEEDLE_RATIOS = (100.0, 1e4)  # largest by smallest standard deviation
 _NEAR_SHARE = 1 / 50  # suggested near plane by the distance to what is looked at
 _NEAR_LIMIT_M = 0.2
+INTERIOR = {"merged": "merged from their children", "given": "given, not merges of their children"}
 _NODE_BYTES = 24  # parent, first child, child count, R, e, leaf id
 
 Float64 = NDArray[np.float64]
@@ -235,15 +237,19 @@ def _describe_tree(tree: LodTree, source: Path, violations: int) -> dict[str, An
     nodes = np.bincount(tree.child_count)
     metadata = tree.metadata
     sizes = {file.name: file.stat().st_size for file in sorted(source.iterdir()) if file.is_file()}
+    above_one = int(np.count_nonzero((tree.gaussians.opacities > 1) & (tree.child_count > 0)))
     return {
         "tree": str(source),
         "nodes": len(tree),
         "leaves": int(nodes[0]),
         "levels": tree.levels,
-        "level_nodes": np.diff(tree.level_offsets).tolist(),
+        **_level_columns(tree),
         "fan_out": {str(k): int(n) for k, n in enumerate(nodes) if n},
+        "fan_out_max": len(nodes) - 1,
         "sh_degree": tree.sh_degree,
-        "opacities_above_one": int(np.count_nonzero(tree.gaussians.opacities > 1)),
+        "interior": metadata.build.get("interior", "given"),
+        "opacities_above_one": above_one,
+        "opacities_above_one_share": above_one / max(len(tree) - int(nodes[0]), 1),
         "bytes_on_disk": sum(sizes.values()),
         "bytes_of_files": sizes,
         "nesting_violations": violations,
@@ -255,6 +261,16 @@ def _describe_tree(tree: LodTree, source: Path, violations: int) -> dict[str, An
     }
 
 
+def _level_columns(tree: LodTree) -> dict[str, list[Any]]:
+    """One entry per level: its nodes, its leaves, the median extent e of its nodes."""
+    levels = [slice(*bounds) for bounds in itertools.pairwise(tree.level_offsets.tolist())]
+    return {
+        "level_nodes": [level.stop - level.start for level in levels],
+        "level_leaves": [int(np.count_nonzero(tree.child_count[level] == 0)) for level in levels],
+        "level_median_extent_m": [float(np.median(tree.extent[level])) for level in levels],
+    }
+
+
 def _tree_text(data: dict[str, Any]) -> str:
     inner = data["nodes"] - data["leaves"]
     children = (data["nodes"] - 1) / max(inner, 1)
@@ -262,9 +278,10 @@ def _tree_text(data: dict[str, Any]) -> str:
     lines = [
         f"{data['tree']}: {data['nodes']} nodes, {data['leaves']} leaves, {data['levels']} levels, "
         f"spherical harmonics of degree {data['sh_degree']}",
-        f"nodes per level: {', '.join(str(n) for n in data['level_nodes'])}",
-        f"children per interior node: {children:.2f}, opacity above 1 in "
-        f"{data['opacities_above_one']} of {inner}",
+        f"interior nodes: {INTERIOR[data['interior']]}; opacity above 1 in "
+        f"{data['opacities_above_one']} of {inner} ({data['opacities_above_one_share']:.1%})",
+        *_level_lines(data),
+        f"children per interior node: {children:.2f}, at most {data['fan_out_max']}",
         *_fan_out_lines({int(k): n for k, n in data["fan_out"].items()}),
         f"on disk: {data['bytes_on_disk'] / 1e6:.1f} MB; {checked}",
         *(f"  {name:18} {size:>14} B" for name, size in data["bytes_of_files"].items()),
@@ -272,6 +289,17 @@ def _tree_text(data: dict[str, Any]) -> str:
         f"nesting: {data['nesting_violations']} violations on {data['nodes'] - 1} edges",
     ]
     return "\n".join(lines)
+
+
+def _level_lines(data: dict[str, Any]) -> list[str]:
+    columns = (data[f"level_{name}"] for name in ("nodes", "leaves", "median_extent_m"))
+    return [
+        f"{'level':>7} {'nodes':>11} {'leaves':>11}  median extent, m",
+        *(
+            f"{level:>7} {nodes:>11} {leaves:>11}  {extent:.4g}"
+            for level, (nodes, leaves, extent) in enumerate(zip(*columns, strict=True))
+        ),
+    ]
 
 
 def _fan_out_lines(fan_out: dict[int, int]) -> list[str]:

@@ -89,6 +89,7 @@ class SimulateOptions:
     trace_fov: bool  # off-axis display from the recording's half-angles
     out: Path
     html: bool
+    paced: bool = False  # messages within what the link carries between two searches
 
 
 @dataclass(frozen=True)
@@ -161,6 +162,7 @@ class BuildTreeOptions:
     tiled: TiledTree | None = None  # instead of the scene
     pair_within: int = 16
     fan_out_ratio: float = 1.0
+    structure: Literal["merged", "blocks", "instances", "octree"] = "merged"
 
 
 @dataclass(frozen=True)
@@ -176,6 +178,27 @@ class SearchOptions:
     method: str  # one of nebula.search.METHODS
     compare: bool  # all methods, not only that one
     hysteresis: float
+
+
+@dataclass(frozen=True)
+class StreamOptions:
+    """``nebula stream``: a trace through cloud, link and client, without rendering."""
+
+    tree: Path | None  # None: the tree of the scene
+    scene: SceneOptions
+    seed: int
+    frames: int | None  # None: enough for 450 searches
+    tau_px: float
+    search_every: int
+    method: str  # one of lod_cloud.search.SEARCHES
+    hysteresis: float
+    codec: Literal["paper", "compact"]
+    rate_mbps: float
+    latency_ms: float
+    paced: bool
+    loss: float  # share of the messages, either way; likewise the others
+    reorder: float
+    corruption: float
 
 
 @dataclass(frozen=True)
@@ -204,6 +227,12 @@ class FigureOptions:
     seed: int
     baseline_m: float
     out: Path
+    # of figures that search a tree; None: not given, the figure's own choice
+    tree: Path | None = None
+    tau_px: float | None = None
+    search_every: int | None = None
+    frames: int | None = None
+    shrink: int | None = None  # pictures are 1 / shrink of the display, each way
 
 
 def scene_options(

@@ -11,6 +11,7 @@ from gaussians.errors import InputError
 from gaussians.placement import parse_view
 from gaussians.rotations import level_rotation
 from lod_cloud import LodTree, SearchRequest, load_tree
+from lod_cloud.imports.octree import STRUCTURE
 from lod_cloud.search import (
     SEARCHES,
     CityGaussianSearch,
@@ -107,7 +108,7 @@ def measure_methods(
 
 def _rule(method: str, hot: SearchTree, tree: LodTree) -> RuleSearch | None:
     if method == OctreeGsSearch.name:
-        return OctreeGsSearch(hot)
+        return OctreeGsSearch(hot, octree=tree.metadata.build.get("structure") == STRUCTURE)
     if method == CityGaussianSearch.name:
         return CityGaussianSearch(hot, up=tree.metadata.up)
     return None
@@ -127,7 +128,7 @@ def _requests(tree: LodTree, options: SearchOptions) -> list[SearchRequest]:
         raise InputError(
             f"--frames must be at least {least}: the first {DROPPED} searches are not counted"
         )
-    view, up = _start(tree, options)
+    view, up = start_pose(tree, options.scene.view, str(options.tree))
     rate_hz = load_session_config().display_rate.hz
     trace = head_trace(options.scene.trace, view, up, frames, rate_hz, options.seed)
     focal_px = options.scene.display.fx
@@ -137,17 +138,19 @@ def _requests(tree: LodTree, options: SearchOptions) -> list[SearchRequest]:
     ]
 
 
-def _start(tree: LodTree, options: SearchOptions) -> tuple[Pose, str]:
-    """First pose and up axis: the given view, else the tree's own start along its path."""
+def start_pose(tree: LodTree, view: str | None, name: str) -> tuple[Pose, str]:
+    """First pose and up axis: the given view (EX,EY,EZ:LX,LY,LZ), else the tree's own start along
+    its path. Raises InputError naming the tree where there is neither.
+    """
     metadata = tree.metadata
     axis = int(np.argmax(np.abs(metadata.up)))
     up = ("-" if metadata.up[axis] < 0 else "+") + "xyz"[axis]
     vertical = np.array(metadata.up)
-    if options.scene.view is not None:
-        eye, target = np.array(parse_view(options.scene.view)) / metadata.units_per_metre
+    if view is not None:
+        eye, target = np.array(parse_view(view)) / metadata.units_per_metre
         return look_at(eye, target, vertical), up
     if metadata.start is None:
-        raise InputError(f"{options.tree}: the tree names no start; --view must be given")
+        raise InputError(f"{name}: the tree names no start; --view must be given")
     start = np.array(metadata.start)
     if len(metadata.path) < 2:
         return Pose(start, level_rotation(up)), up

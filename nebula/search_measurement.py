@@ -46,11 +46,12 @@ def measure_search(
     """Let a fresh search answer every request. Without a reference it is its own, and the overlap
     of its cuts is measured too.
     """
-    signatures, times_ms, counts = [], [], []
+    signatures, times_ms, cpu_ms, counts = [], [], [], []
     overlap = _Overlap(len(search.tree), frames_per_search)
     for index, request in enumerate(requests):
-        begin = time.perf_counter()
+        begin, cpu_begin = time.perf_counter(), time.process_time()
         result = search.search(request)
+        cpu_ms.append(1e3 * (time.process_time() - cpu_begin))
         times_ms.append(1e3 * (time.perf_counter() - begin))
         signatures.append(_signature(result))
         counts.append(_counts(result))
@@ -60,7 +61,7 @@ def measure_search(
     compared = zip(signatures, reference or signatures, strict=True)
     identical = sum(own == other for own, other in list(compared)[DROPPED:])
     tested, touched, adds, removes, sizes = np.mean(counts[DROPPED:], axis=0)
-    row = _row(search.name, counted, times_ms[0]) | {
+    row = _row(search.name, counted, cpu_ms, times_ms[0]) | {
         "nodes_tested_mean": float(tested),
         "bytes_touched_mean": float(touched),
         "adds_mean": float(adds),
@@ -79,13 +80,14 @@ def measure_rule(
     """Let a baseline rule answer every request. Its set is another one by construction:
     ``identical_to_flat`` is None.
     """
-    times_ms, counts, changes = [], [], []
+    times_ms, cpu_ms, counts, changes = [], [], [], []
     overlap = _Overlap(len(rule.tree), frames_per_search)
     stride = max(1, (len(requests) - DROPPED) // _RULE_SAMPLES)
     before: Int32 | None = None
     for index, request in enumerate(requests):
-        begin = time.perf_counter()
+        begin, cpu_begin = time.perf_counter(), time.process_time()
         selection = rule.select(request)
+        cpu_ms.append(1e3 * (time.process_time() - cpu_begin))
         times_ms.append(1e3 * (time.perf_counter() - begin))
         ids = selection.node_ids
         counts.append((selection.nodes_tested, selection.bytes_touched, len(ids)))
@@ -98,7 +100,7 @@ def measure_rule(
     counted = np.array(times_ms[DROPPED:])
     tested, touched, sizes = np.mean(counts[DROPPED:], axis=0)
     adds, removes = np.mean(changes, axis=0)
-    row = _row(rule.name, counted, times_ms[0]) | {
+    row = _row(rule.name, counted, cpu_ms, times_ms[0]) | {
         "nodes_tested_mean": float(tested),
         "bytes_touched_mean": float(touched),
         "adds_mean": float(adds),
@@ -111,13 +113,16 @@ def measure_rule(
     return Measured(row, [], counted)
 
 
-def _row(method: str, counted: NDArray[np.float64], first_ms: float) -> dict[str, Any]:
+def _row(
+    method: str, counted: NDArray[np.float64], cpu_ms: Sequence[float], first_ms: float
+) -> dict[str, Any]:
     return {
         "method": method,
         "searches": len(counted),
         "p50_ms": float(np.percentile(counted, 50)),
         "p99_ms": float(np.percentile(counted, 99)),
         "max_ms": float(counted.max()),
+        "cpu_p50_ms": float(np.percentile(cpu_ms[DROPPED:], 50)),  # of all threads together
         "first_ms": first_ms,
         "threads": threads(),
     }

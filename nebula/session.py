@@ -22,8 +22,9 @@ from lod_cloud import (
     PaperCodec,
     SearchRequest,
     SearchStats,
+    SearchTree,
     Selection,
-    flat_search,
+    make_search,
 )
 from lod_cloud.link import Transmission
 from nebula.session_config import SessionConfig
@@ -57,7 +58,11 @@ class _Underway:
 
 
 class Session:
-    """One client and its cloud over one link. Owns both ends and the messages between them."""
+    """One client and its cloud over one link. Owns both ends and the messages between them.
+
+    ``paced``: a message has at most the bytes that the link carries between two searches; the
+    client's cut may then lag behind the one found.
+    """
 
     def __init__(
         self,
@@ -66,12 +71,21 @@ class Session:
         config: SessionConfig,
         link: Link,
         search_every: int,
+        *,
+        paced: bool = False,
     ) -> None:
+        interval_s = search_every / config.display_rate.hz
+        self.budget_bytes = link.bytes_in(interval_s) if paced else None
+        lod = config.search
+        self.method = lod.method
+        self._lod = make_search(lod.method, SearchTree.of(tree), hysteresis=lod.hysteresis)
         self.cloud = Cloud(
             tree,
             codec,
+            search=self._lod,
             frames_per_search=search_every,
             reuse_window_frames=config.reuse_window.frames,
+            budget_bytes=self.budget_bytes,
         )
         self.client = Client()
         self.searches: list[SearchStats] = []
@@ -83,7 +97,7 @@ class Session:
         self._search_every = search_every
 
     def start(self, request: SearchRequest) -> StartUp:
-        """Bring the client to the first cut."""
+        """Bring the client to the first cut, or, paced, to the coarse one that comes first."""
         header = self.cloud.session_start()
         self.client.receive(header)
         message = self._search(request, 0)
@@ -125,10 +139,11 @@ class Session:
 
     def _search(self, request: SearchRequest, frame: int) -> bytes:
         self.cloud.receive(self.client.report())
+        asked = self.cloud.asked(request)
         begin = time.perf_counter()
-        cut = flat_search(self.cloud.tree, request)
+        found = self._lod.search(asked)
         self.search_ms.append(1e3 * (time.perf_counter() - begin))
-        message = self.cloud.send(cut, frame)
+        message = self.cloud.answer(found, asked, frame)
         assert self.cloud.stats is not None
         self.searches.append(self.cloud.stats)
         return message

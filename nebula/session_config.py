@@ -42,6 +42,18 @@ class CloudTime(Provenance):
 
 
 @dataclass(frozen=True, kw_only=True)
+class LodSearch(Provenance):
+    """How the cloud searches: see `lod_cloud.make_search`."""
+
+    method: str
+    hysteresis: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.require_not_negative("hysteresis")
+
+
+@dataclass(frozen=True, kw_only=True)
 class CodebookSize(Provenance):
     """Vector quantisation of the spherical harmonics."""
 
@@ -60,6 +72,7 @@ class SessionConfig:
     reuse_window: ReuseWindow
     display_rate: DisplayRate
     cloud: CloudTime
+    search: LodSearch
     codebook: CodebookSize
 
 

@@ -34,8 +34,8 @@ from nebula.session_config import SessionConfig, load_session_config
 NOTES = (
     "Timing is of fidelity `analytic`: each unit's cycles are bounds from counters of this run, "
     "and the slowest unit sets the frame time; no queueing between units is simulated.",
-    "Search is `flat` (every node, every time; `nebula search --compare` times the others), and "
-    "the cloud's computing time is an assumption, listed under sources.",
+    "Search method and hysteresis are listed under sources (`nebula search --compare` times the "
+    "others), and the cloud's computing time is an assumption, listed there too.",
     "The link loses nothing; messages arrive in order.",
     "Image arithmetic is float32; `nebula figure formats` says what fixed point would change.",
     "The paper's six data sets are not available here; its figures are compared only where they do "
@@ -172,7 +172,8 @@ def _method(options: SimulateOptions, hardware: Hardware) -> StereoMethod:
 
 def _play(options: SimulateOptions, setting: _Setting) -> _Outcome:
     place, trace, link = setting.place, setting.trace, setting.link
-    session = Session(setting.tree, setting.codec, setting.config, link, options.search_every)
+    tree, codec, config = setting.tree, setting.codec, setting.config
+    session = Session(tree, codec, config, link, options.search_every, paced=options.paced)
     quality = QualityComparison(setting.tree, place.scene, options.frames)
     records: list[FrameRecord] = []
     with progress("encoding the first cut"):

@@ -43,23 +43,20 @@ FLOAT64 = {
     "lod_cloud.harmonics": "parents are merged in float64 and rounded once",
     "lod_cloud.merge": "same; sizes are rounded up",
     "lod_cloud.moments": "same",
+    "lod_cloud.pairing": "costs of merging, and the moments that merge",
+    "lod_cloud.siblings": "clients merge as the builder does",
+    "lod_cloud.spheres": "sizes in float64, rounded up",
     "lod_cloud.search.sectors": "bounds on the camera's way; no decision is taken with them",
     "lod_cloud.search.treelets._margin": "how long a decision holds, by a stated bound",
     "lod_cloud.search.treelets.search_treelets": "keeps those margins; decisions are float32",
-    "lod_cloud.search.wheel_kernels._bucket": "how long a decision holds, by a stated bound",
-    "lod_cloud.search.wheel_kernels.collect": "moves the hands, rounded up",
-    "lod_cloud.search.wheel_kernels.insert": "how long a decision holds, by a stated bound",
+    "lod_cloud.search.wheel_buckets": "when an entry is due, by a stated bound",
 }
 # Of these, where float32 matters beside float64: the float64 variables by name.
 NAMES = {
     "gaussians.projection._project": {"det", "wide_xx", "wide_xy", "wide_yy"},
     "lod_cloud.search.treelets.search_treelets": {"balls", "dx", "dy", "dz", "holds", "least"},
-    "lod_cloud.search.wheel_kernels.collect": {
-        *("step", "hands", "rates", "axes", "cosines", "sines"),
-        *("length", "advance", "along", "before", "now"),
-    },
     "lod_cloud.criterion._count_violations": {
-        *("away", "unit", "distance", "length", "shell", "shells"),
+        *("ax", "ay", "az", "sx", "sy", "sz", "length", "away", "cameras"),
     },
 }
 

@@ -125,6 +125,11 @@ def _kind_of(file: Path) -> str:
     suffix = file.suffix.lower()
     if suffix in (".ply", ".splat", ".spz", ".sog"):
         return suffix[1:]
+    if suffix == ".hier":
+        raise InputError(
+            f"{file}: must be a scene, not a .hier hierarchy, whose layout no free description "
+            "tells (docs/formats.md); convert its leaves to .ply and build a tree of them"
+        )
     if suffix == ".json":
         document = parse_json_object(read_bounded(file, JSON_LIMIT_BYTES), str(file))
         if "layouts" in document:

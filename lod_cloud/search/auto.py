@@ -8,12 +8,12 @@ import numpy as np
 
 from lod_cloud.criterion import SearchRequest
 from lod_cloud.lod_tree import Int32
-from lod_cloud.search import wheel_kernels as kernels
+from lod_cloud.search import wheel_decisions as decisions
 from lod_cloud.search.search_tree import SearchTree
 from lod_cloud.search.wheel import WheelSearch
 
-_TESTS_SHARE = 1 / 64  # of the nodes the last full search tested: what the wheel may test instead
-_FILL_SHARE = 1 / 192  # likewise, the entries that may be made beside a full search
+_TESTS_SHARE = 1 / 128  # of the nodes the last full search tested: what the wheel may test instead
+_FILL_SHARE = 1 / 512  # likewise, the entries that may be made beside a full search
 _LEAST = 256
 
 
@@ -43,10 +43,10 @@ class AutoSearch(WheelSearch):
             return self._jump(request)
         if self._filled < len(self.tree):
             return self._fill_further(request, due)
-        expanded, collapsed, tested = self._process(due, budget)
+        expanded, collapsed, tested = self._settle(due, budget)
         if tested > budget:
-            kernels.set_marks(expanded, self.refined, False)
-            kernels.set_marks(collapsed, self.refined, True)
+            decisions.set_marks(expanded, self.refined, False)
+            decisions.set_marks(collapsed, self.refined, True)
             return self._jump(request, tested)
         return np.sort(expanded), np.sort(collapsed), tested, self._touched(len(due), tested)
 
@@ -61,10 +61,10 @@ class AutoSearch(WheelSearch):
 
     def _fill_further(self, request: SearchRequest, due: Int32) -> tuple[Int32, Int32, int, int]:
         """A full search; entries that are due or became active are made anew, and some more."""
-        kernels.set_marks(due, self._scheduled, False)
+        decisions.set_marks(due, self._scheduled, False)
         expanded, collapsed, tested, touched = self._stream(request)
         self._full_tests = tested
         changed = np.concatenate([due, expanded, collapsed])
-        self._insert(kernels.active_among(changed, self._ints, self.refined, self._scheduled))
+        self._insert(decisions.active_among(changed, self._ints, self.refined, self._scheduled))
         self._filled = self._fill(self._filled, max(_LEAST, int(tested * _FILL_SHARE)))
         return expanded, collapsed, tested, touched + self._touched(len(changed), 0)

@@ -12,10 +12,10 @@ from lod_cloud.criterion import SearchRequest
 from lod_cloud.cut import Cut
 from lod_cloud.lod_tree import LodTree
 from lod_cloud.search.interface import FullSearch
-from lod_cloud.search.marks import BLOCK, test_block
+from lod_cloud.search.marks import test_group
 from lod_cloud.search.search_tree import Marks, SearchTree
 
-BYTES_PER_TEST = 12 + 4 + 4 + 4  # mean, R, e, child count
+BYTES_PER_TEST = 12 + 4 + 4  # mean, R (which says what a leaf is), e
 
 
 def flat_search(tree: LodTree, request: SearchRequest) -> Cut:
@@ -27,7 +27,7 @@ def flat_search(tree: LodTree, request: SearchRequest) -> Cut:
 
 
 class FlatSearch(FullSearch):
-    """One scan over all nodes in breadth-first order, 64 side by side.
+    """One scan over all nodes in breadth-first order, 16 side by side.
 
     Every node is tested, whether or not its parent is refined: the test is nested, and reading
     the node costs more than testing it.
@@ -36,28 +36,24 @@ class FlatSearch(FullSearch):
     name: ClassVar[str] = "flat"
 
     def _mark(self, request: SearchRequest, before: Marks, marks: Marks) -> tuple[int, int]:
-        tree = self.tree
-        marks[:] = before
+        groups = self.tree.groups
         cx, cy, cz = request.camera
         run_chunks(
             _scan,
-            len(marks) // (BLOCK // 8),
+            len(groups),
             cx,
             cy,
             cz,
             request.factor,
             self.grow,
-            tree.child_count,
-            tree.positions,
-            tree.radius,
-            tree.extent,
-            marks,
+            groups,
+            before.view(np.uint16),
+            marks.view(np.uint16),
         )
-        return len(tree), BYTES_PER_TEST * len(tree)
+        return len(self.tree), BYTES_PER_TEST * len(self.tree)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _scan(begin, end, cx, cy, cz, k, grow, child_count, positions, radius, extent, marks):  # type: ignore[no-untyped-def]
-    flags = np.empty(BLOCK, np.uint8)
-    for block in range(begin, end):
-        test_block(block, cx, cy, cz, k, grow, child_count, positions, radius, extent, marks, flags)
+def _scan(begin, end, cx, cy, cz, k, grow, groups, before, marks):  # type: ignore[no-untyped-def]
+    for group in range(begin, end):
+        marks[group] = test_group(group, cx, cy, cz, k, grow, groups, before)

@@ -13,26 +13,36 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gaussians.errors import InputError
+from gaussians.parallel import run_chunks
+from lod_cloud.array_file import release_pages
 from lod_cloud.lod_tree import Float32, Int32
 from lod_cloud.search.marks import set_bit
+from lod_cloud.search_arrays import (
+    GROUP,
+    GROUP_ROWS,
+    RECORD_COLUMNS,
+    SearchArrays,
+    aligned,
+    number_of_groups,
+    put_groups,
+    put_records,
+)
 
 if TYPE_CHECKING:
     from lod_cloud.lod_tree import LodTree
 
 Marks = NDArray[np.uint8]  # one bit per node, see `lod_cloud.search.marks`
 
-FIRST_CHILD, CHILD_COUNT, PARENT = 5, 6, 7  # columns of a record after x, y, z, R, e
-RECORD_COLUMNS = 8
-_LINE_BYTES = 64
-_CHUNK = 1 << 18
+_CHUNK = 1 << 14  # groups made at a time
 
 
 @dataclass(frozen=True)
 class SearchTree:
     """Topology and node test of a tree, without its Gaussians. Shared by any number of clients.
 
-    36 B per node, or nothing where the arrays are memory-mapped; `records` adds 32 B per node for
-    the searches that visit nodes in no particular order.
+    Beside the arrays themselves (36 B per node) searches read `groups` (20 B per node) or `records`
+    (32 B): nothing in memory where they are mapped from a tree on disk, else they are made when a
+    search first asks for them.
     """
 
     parent: Int32  # [N], -1 for the root
@@ -42,6 +52,7 @@ class SearchTree:
     means: Float32  # [N, 3]
     radius: Float32  # [N]
     extent: Float32  # [N]
+    stored: SearchArrays | None = None  # where they exist already
 
     def __post_init__(self) -> None:
         count = len(self.parent)
@@ -51,6 +62,11 @@ class SearchTree:
             array = getattr(self, name)
             if len(array) != count or not array.flags.c_contiguous:
                 raise InputError(f"search tree: {name} must be contiguous with {count} rows")
+        if self.stored is not None:
+            shapes = self.stored.groups.shape, self.stored.records.shape
+            wanted = ((number_of_groups(count), GROUP_ROWS, GROUP), (count, RECORD_COLUMNS))
+            if shapes != wanted:
+                raise InputError(f"search tree: stored arrays must be {wanted}, not {shapes}")
 
     @classmethod
     def of(cls, tree: LodTree) -> SearchTree:
@@ -63,42 +79,64 @@ class SearchTree:
             tree.gaussians.means,
             tree.radius,
             tree.extent,
+            tree.search_arrays,
         )
 
     def __len__(self) -> int:
         return len(self.parent)
-
-    @property
-    def positions(self) -> Float32:
-        """The means as one row of 3 N numbers."""
-        return self.means.reshape(-1)
 
     def new_marks(self) -> Marks:
         """A bit per node, all clear."""
         return np.zeros(-(-len(self) // 64) * 8, np.uint8)
 
     @cached_property
-    def records(self) -> tuple[Float32, Int32]:
-        """[N, 8] everything about a node in half a cache line, as float32 and as int32.
+    def groups(self) -> Float32:
+        """[ceil(N / 16), 5, 16] the node tests of 16 nodes side by side (`SearchArrays`)."""
+        if self.stored is not None:
+            return self.stored.groups
+        groups = aligned(number_of_groups(len(self)), GROUP_ROWS, GROUP)
+        run_chunks(self._put_groups, -(-len(groups) // _CHUNK), groups)
+        return groups
 
-        x, y, z, R, e, first child, child count, parent; R is NaN for leaves, which makes the node
-        test fail for them. Both arrays are the same memory.
+    def release_groups(self) -> None:
+        """Let go of the memory of groups that are mapped; they come back when they are read."""
+        if self.stored is not None:
+            release_pages(self.stored.groups)
+
+    def _put_groups(self, begin: int, end: int, groups: Float32) -> None:
+        for chunk in range(begin, end):
+            rows = slice(chunk * _CHUNK * GROUP, (chunk + 1) * _CHUNK * GROUP)
+            put_groups(
+                groups[chunk * _CHUNK : (chunk + 1) * _CHUNK],
+                self.means[rows],
+                self.radius[rows],
+                self.extent[rows],
+                self.child_count[rows],
+            )
+
+    @cached_property
+    def records(self) -> tuple[Float32, Int32]:
+        """[N, 8] everything about a node (`SearchArrays`), as float32 and, the same memory, as
+        int32.
         """
-        count = len(self)
-        store = np.empty(count * RECORD_COLUMNS * 4 + _LINE_BYTES, np.uint8)
-        shift = -store.ctypes.data % _LINE_BYTES
-        numbers = store[shift : shift + count * RECORD_COLUMNS * 4].view(np.float32)
-        floats = numbers.reshape(count, RECORD_COLUMNS)
-        ints = floats.view(np.int32)
-        for begin in range(0, count, _CHUNK):
-            rows = slice(begin, begin + _CHUNK)
-            floats[rows, :3] = self.means[rows]
-            floats[rows, 3] = np.where(self.child_count[rows] > 0, self.radius[rows], np.nan)
-            floats[rows, 4] = self.extent[rows]
-            ints[rows, FIRST_CHILD] = self.first_child[rows]
-            ints[rows, CHILD_COUNT] = self.child_count[rows]
-            ints[rows, PARENT] = self.parent[rows]
-        return floats, ints
+        if self.stored is not None:
+            records = self.stored.records
+        else:
+            records = aligned(len(self), RECORD_COLUMNS)
+            run_chunks(self._put_records, -(-len(self) // (_CHUNK * GROUP)), records)
+        return records, records.view(np.int32)
+
+    def _put_records(self, begin: int, end: int, records: Float32) -> None:
+        rows = slice(begin * _CHUNK * GROUP, end * _CHUNK * GROUP)
+        put_records(
+            records[rows],
+            self.means[rows],
+            self.radius[rows],
+            self.extent[rows],
+            self.child_count[rows],
+            self.first_child[rows],
+            self.parent[rows],
+        )
 
     def treelet_roots(self, size: int) -> Marks:
         """Marks of the roots of the treelets of at least ``size`` nodes; made once per size."""

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 Float64 = NDArray[np.float64]
 
-SIDE = 4  # cells along an edge of a cube face
+SIDE = 6  # cells along an edge of a cube face
 SECTORS = 6 * SIDE * SIDE
 _WIDENED = 1e-6  # radians; what is lost when a direction is computed and assigned
 _BEND = 0.2732  # makes cells of a face more alike

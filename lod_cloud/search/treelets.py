@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from lod_cloud.search.marks import clear_bit, is_set, set_bit, stays_refined
-from lod_cloud.search.search_tree import CHILD_COUNT, FIRST_CHILD, PARENT
+from lod_cloud.search_arrays import CHILD_COUNT, FIRST_CHILD, PARENT
 
 _SLACK = 2.0**-21  # of T; the float32 test agrees with real numbers beyond half of that
 _TINY = 1e-15  # metres

@@ -8,14 +8,17 @@ import numpy as np
 
 from lod_cloud.criterion import SearchRequest
 from lod_cloud.lod_tree import Int32
-from lod_cloud.search import wheel_kernels as kernels
+from lod_cloud.search import wheel_buckets as wheel
+from lod_cloud.search import wheel_decisions as decisions
 from lod_cloud.search.interface import Search
-from lod_cloud.search.search_tree import CHILD_COUNT, SearchTree
+from lod_cloud.search.search_tree import SearchTree
 from lod_cloud.search.sectors import SectorTable, sector_table
 from lod_cloud.search.streaming import StreamingSearch
+from lod_cloud.search_arrays import CHILD_COUNT
 
 UNLIMITED = 2**62
 _UNKNOWN_RATE = 0.5  # of a hand of refined nodes, before the first step
+_FEW = 1 << 16  # nodes
 _RECORD_BYTES, _ENTRY_BYTES, _MARK_BYTES = 32, 4, 3
 
 
@@ -25,12 +28,12 @@ class WheelSearch(Search):
     By nesting, only a cut node can be the next to expand and only a refined node without refined
     child the next to collapse. Each such node has one entry (4 B) in a bucket of a timing wheel,
     keyed by how far the camera must come in the node's direction before the decision can change;
-    see `lod_cloud.search.wheel_kernels`. An entry is a statement about geometry, not about the
+    see `lod_cloud.search.wheel_buckets`. An entry is a statement about geometry, not about the
     cut: it stays when its node leaves the cut and holds when it comes back.
 
     The first search, and one whose tau or focal length differ from the last, are streamed and the
-    wheel is filled again. Per client: 3 bits per node, 5.4 B per entry,
-    and 9 MB for the wheel itself, of which an idle one touches a tenth.
+    wheel is filled again. Per client: 3 bits per node, 4.3 B per entry, and 68 B for every bucket
+    in use.
     """
 
     name: ClassVar[str] = "wheel"
@@ -40,14 +43,16 @@ class WheelSearch(Search):
         self._floats, self._ints = tree.records
         self._sectors: SectorTable = sector_table()
         self._full = StreamingSearch(tree, hysteresis=hysteresis)
-        self._hands = np.zeros(kernels.HANDS)
-        self._rates = np.full(kernels.HANDS, _UNKNOWN_RATE)  # of the hands, per metre of path
-        self._heads = np.full(kernels.BUCKETS, -1, np.int32)  # first chunk of a bucket, or -1
-        self._held = np.zeros(kernels.BUCKETS, np.uint8)  # ids in it; the others are full
+        self._hands = np.zeros(wheel.HANDS)
+        self._rates = np.full(wheel.HANDS, _UNKNOWN_RATE)  # of the hands, per metre of path
+        self._heads = np.full(wheel.BUCKETS, -1, np.int32)
         self._counts = np.array([-1, 0], np.int32)
-        self._chunks = np.empty((0, kernels.PER_CHUNK + 1), np.int32)
+        self._chunks = np.empty((0, wheel.PER_CHUNK + 1), np.int32)
         self._scheduled = tree.new_marks()  # nodes that have an entry
         self._entries = 0
+        # room for the worst case; memory is taken by what is written
+        self._lists = np.empty((3, len(tree)), np.int32)
+        self._numbers = np.zeros(3, np.int64)
         self._camera = np.zeros(3, np.float32)
         self._factor = np.float32(0.0)  # k of the last search; of none before the first
 
@@ -55,12 +60,13 @@ class WheelSearch(Search):
         if request.factor != self._factor:
             return self._start_again(request)
         due = self._collect(request)
-        expanded, collapsed, tested = self._process(due, UNLIMITED)
+        expanded, collapsed, tested = self._settle(due, UNLIMITED)
         return np.sort(expanded), np.sort(collapsed), tested, self._touched(len(due), tested)
 
     def _start_again(self, request: SearchRequest) -> tuple[Int32, Int32, int, int]:
         """A full search, and a wheel filled anew."""
         outcome = self._stream(request)
+        self.tree.release_groups()  # the wheel reads records
         self._clear()
         self._camera, self._factor = request.camera, request.factor
         self._fill(0, UNLIMITED)
@@ -83,12 +89,11 @@ class WheelSearch(Search):
         """Move the hands to the new camera; nodes whose entries are due."""
         step = request.camera.astype(np.float64) - self._camera
         self._camera = request.camera
-        due: Int32 = kernels.collect(
+        due: Int32 = wheel.collect(
             step,
             self._hands,
             self._rates,
             self._heads,
-            self._held,
             self._counts,
             self._chunks,
             *self._sectors,
@@ -96,10 +101,10 @@ class WheelSearch(Search):
         self._entries -= len(due)
         return due
 
-    def _process(self, due: Int32, budget: int) -> tuple[Int32, Int32, int]:
+    def _settle(self, due: Int32, budget: int) -> tuple[Int32, Int32, int]:
         """Settle what is due; events in no order, and nodes tested."""
         cx, cy, cz = self._camera
-        expanded, collapsed, waiting, tested = kernels.process(
+        tested: int = decisions.settle(
             due,
             cx,
             cy,
@@ -111,26 +116,35 @@ class WheelSearch(Search):
             self.refined,
             self._scheduled,
             budget,
+            self._lists,
+            self._numbers,
+        )
+        opened, closed, waiting = (
+            row[:count] for row, count in zip(self._lists, self._numbers, strict=True)
         )
         if tested <= budget:
             self._insert(waiting)
-        return expanded, collapsed, tested
+        return opened.copy(), closed.copy(), tested
 
     def _fill(self, begin: int, most: int) -> int:
         """Schedule active nodes from node ``begin`` on; where to go on."""
-        nodes, at = kernels.active_nodes(begin, most, self._ints, self.refined, self._scheduled)
+        tree = self.tree
+        nodes, at = decisions.active_nodes(
+            begin, most, tree.first_child, tree.child_count, self.refined, self._scheduled
+        )
         self._insert(nodes)
         return int(at)
 
     def _insert(self, nodes: Int32) -> None:
         self._entries += len(nodes)
-        needed = kernels.BUCKETS + self._entries // kernels.PER_CHUNK  # one of each is not full
+        # one chunk of a bucket is not full
+        needed = min(wheel.BUCKETS, self._entries) + self._entries // wheel.PER_CHUNK
         if needed > len(self._chunks):
-            larger = np.empty((needed + needed // 4, kernels.PER_CHUNK + 1), np.int32)
+            larger = np.empty((needed + needed // 4, wheel.PER_CHUNK + 1), np.int32)
             larger[: len(self._chunks)] = self._chunks
             self._chunks = larger
         cx, cy, cz = self._camera
-        kernels.insert(
+        wheel.insert(
             nodes,
             cx,
             cy,
@@ -142,13 +156,14 @@ class WheelSearch(Search):
             self._hands,
             self._rates,
             self._heads,
-            self._held,
             self._counts,
             self._chunks,
         )
 
     def _growth(self, nodes: Int32) -> int:
-        """As for every search, from the records, which are in the cache already."""
+        """As for every search; few nodes are in the cache already, with their records."""
+        if len(nodes) > _FEW:
+            return super()._growth(nodes)
         return int(self._ints[nodes, CHILD_COUNT].sum()) - len(nodes)
 
     @staticmethod
@@ -158,4 +173,4 @@ class WheelSearch(Search):
     @property
     def state_bytes(self) -> int:
         marks = 3 * self.refined.nbytes  # refined now and before, scheduled
-        return marks + self._heads.nbytes + self._held.nbytes + self._chunks.nbytes
+        return marks + self._heads.nbytes + self._chunks.nbytes

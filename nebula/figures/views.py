@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gaussians.cameras import StereoRig
+from gaussians.cameras import Display, StereoRig
 from gaussians.errors import InputError
 from gaussians.projection import ProjectedSplats, project
 from gaussians.spherical_harmonics import fill_colours
@@ -33,13 +33,8 @@ class View:
     @property
     def labels(self) -> dict[str, str]:
         """What every row of this view begins with."""
-        d = self.rig.display
         source = "generated" if self.place.generated else "file"
-        return {
-            "scene": self.name,
-            "display": f"{d.width} x {d.height} px, f {d.fx:.1f} px",
-            "source": f"{source}: {self.place.name}",
-        }
+        return labels(self.name, self.rig.display, f"{source}: {self.place.name}")
 
     @property
     def description(self) -> dict[str, Any]:
@@ -91,17 +86,32 @@ class Views:
         return "".join(f"\nnot measured: {m['scene']} ({m['reason']})" for m in self.missing)
 
 
+def labels(name: str, display: Display, source: str) -> dict[str, str]:
+    """Scene, display and source, as every row of every figure names them."""
+    shown = f"{display.width} x {display.height} px, f {display.fx:.1f} px"
+    return {"scene": name, "display": shown, "source": source}
+
+
+def scene_name(options: FigureOptions) -> str | None:
+    """Short name of the scene the command line asks for, if it does."""
+    given = options.given
+    named = next((given[k] for k in ("scene", "city_leaves") if given.get(k) is not None), None)
+    if named is None and options.config is None:
+        return None
+    name = f"city of {named}" if isinstance(named, int) else str(named or options.config)
+    return Path(name).stem
+
+
 def choose_views(options: FigureOptions, defaults: Sequence[str]) -> Views:
     """The one scene the command line names, else the ``defaults`` whose files are here.
 
     Raises InputError when a named scene, or every default, is not here.
     """
     given = {**options.given, "trace": "stand"}
-    named = next((given[k] for k in ("scene", "city_leaves") if given.get(k) is not None), None)
-    if named is not None or options.config is not None:
-        name = f"city of {named}" if isinstance(named, int) else str(named or options.config)
+    name = scene_name(options)
+    if name is not None:
         scene = scene_options(options.config, given, default_display=DISPLAY)
-        return Views(options, {Path(name).stem: scene}, ())
+        return Views(options, {name: scene}, ())
     missing = {name: reason for name in defaults if (reason := _missing(name)) is not None}
     chosen = {
         name: scene_options(name, given, default_display=DISPLAY)

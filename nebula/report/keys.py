@@ -110,6 +110,16 @@ _SCENE = (
     Key(
         "stream.reuse_window_searches", "integer", "searches", "A node unused for longer is dropped"
     ),
+    Key(
+        "stream.pacing.*",
+        "any",
+        "",
+        "With `--paced` only: `budget_bytes` of a message; after each message `pending_nodes` of "
+        "the cut found that the client's cut lacked, `pending_error_px`, the τ at which the "
+        "client's cut was complete (0: nothing pending; null: not even around the viewer), "
+        "`deferred_bytes`, what the pending nodes were expected to take, and `tau_px` of the "
+        "search",
+    ),
 )
 
 _STEREO = (

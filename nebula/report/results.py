@@ -105,6 +105,7 @@ def streaming(report: Mapping[str, Any]) -> str:
                     ("latency", f"{significant(stream['latency_ms'])} ms"),
                     ("first picture complete after", f"{significant(stream['initial_ms'])} ms"),
                     ("nodes held by the client, most", exact(stream["held_nodes_max"])),
+                    *_pacing(stream["pacing"]),
                 ]
             ),
         ),
@@ -117,6 +118,18 @@ def streaming(report: Mapping[str, Any]) -> str:
         ),
     ]
     return f'<h2>Level of detail and streaming</h2><div class="grid">{"".join(cards)}</div>'
+
+
+def _pacing(pacing: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What a byte budget did; nothing without one."""
+    if not pacing:
+        return []
+    behind = sum(nodes > 0 for nodes in pacing["pending_nodes"])
+    return [
+        ("byte budget of a message", scaled(pacing["budget_bytes"], "B")),
+        ("messages that left something pending", exact(behind)),
+        ("nodes pending, most", exact(max(pacing["pending_nodes"]))),
+    ]
 
 
 def stereo_and_quality(report: Mapping[str, Any]) -> str:

@@ -250,3 +250,28 @@ def test_codebook_sizes_and_outliers() -> None:
         Codebook.train(vectors[4:5], words=4, stages=1, seed=1)
     with pytest.raises(InputError, match=r"1\.\.65536 words"):
         Codebook.train(vectors, words=0, stages=1, seed=1)
+
+
+@given(seeds)
+@settings(max_examples=10, deadline=None)
+def test_fewer_codes_have_the_errors_of_their_steps(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    sizes = (10.0 ** rng.uniform(-3, 1, 300)).astype(np.float32)
+    for round_up in (False, True):
+        field = c.LogField.covering(sizes, round_up=round_up, top=255)
+        codes, valid = field.encode(sizes)
+        ratios = field.decode(codes).astype(float) / sizes
+        assert valid.all() and 1 <= codes.min() <= codes.max() <= 255
+        assert (1.0 if round_up else 1 / field.max_ratio) <= ratios.min()
+        assert ratios.max() <= field.max_ratio
+    line = c.LinearField(-1.0, 2.0, 127)
+    values = rng.uniform(-1, 2, 300).astype(np.float32)
+    codes, _ = line.encode(values)
+    assert codes.max() <= 127
+    assert np.abs(line.decode(codes).astype(float) - values).max() <= line.max_error
+    quaternions = normalised_quaternions(rng.normal(size=(300, 4)))
+    largest, three = c.encode_rotation(quaternions, 255)
+    turned = c.decode_rotation(largest, three, 255).astype(float)
+    cosine = np.minimum(np.abs((turned * quaternions).sum(axis=1)), 1)
+    assert three.max() <= 254
+    assert 2 * np.arccos(cosine).max() <= c.ROTATION_ERROR_RAD * 65535 / 255 + 1e-3

@@ -10,10 +10,13 @@ from numba.core.errors import TypingError
 from gaussians.float32_math import exp_float32
 from gaussians.lanes import (
     WIDTH,
+    bits,
     broadcast,
     count,
     halves,
+    highest_bit,
     load,
+    lowest_bit,
     minimum,
     pair,
     prefetch,
@@ -152,6 +155,24 @@ def test_scaled_multiplies_by_a_power_of_two() -> None:
 @njit(error_model="numpy")
 def _move(source, start, target):
     store(target, start, load(source, start + 1))
+
+
+@njit(error_model="numpy")
+def _bits_below(x, limit):  # [16], float32
+    number = bits(load(x, 0) < limit)
+    if number == 0:
+        return number, -1, -1
+    return number, lowest_bit(number), highest_bit(number)
+
+
+def test_bits_of_a_mask_begin_with_the_first_lane() -> None:
+    rng = np.random.default_rng(0)
+    for number in [0, 1, 1 << 15, 0x8001, 0xFFFF, *rng.integers(0, 1 << 16, 40)]:
+        places = [i for i in range(WIDTH) if number >> i & 1]
+        x = np.full(WIDTH, np.nan, np.float32)
+        x[places] = 0.0
+        expected = (number, places[0], places[-1]) if places else (0, -1, -1)
+        assert _bits_below(x, TWO) == expected
 
 
 def test_load_and_store_count_flat_and_need_no_alignment() -> None:

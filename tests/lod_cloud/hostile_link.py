@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 from functools import cache
-from types import SimpleNamespace
 
 import numpy as np
 from hypothesis import strategies as st
 
 from gaussians.scene import FIELDS, Scene
-from lod_cloud.client import Client
+from lod_cloud.client import Client, _Arrival
 from lod_cloud.cloud import Cloud
-from lod_cloud.codec import PaperCodec
+from lod_cloud.codec import Codec, CompactCodec, PaperCodec
 from lod_cloud.criterion import SearchRequest
-from lod_cloud.cut import Cut, difference
-from lod_cloud.lod_tree import Int32, LodTree
+from lod_cloud.cut import is_complete
+from lod_cloud.events import Events
+from lod_cloud.lod_tree import LodTree
 from lod_cloud.protocol import RemoteProtocolError
-from lod_cloud.search import flat_search
+from lod_cloud.search import SearchTree, make_search
 from lod_cloud.tree_encoder import TreeEncoder
 from tests.lod_cloud.trees import random_tree
 
@@ -28,45 +28,76 @@ Action = tuple[str, int]
 
 @dataclasses.dataclass(frozen=True)
 class World:
-    """One tree, how it is coded, and the cuts of a walk through it."""
+    """One tree, how it is coded, and places along a walk through it."""
 
     tree: LodTree
+    hot: SearchTree
     encoder: TreeEncoder
     decoded: Scene  # what a client must have for every node
-    cuts: list[Cut]
+    places: list[SearchRequest]
 
 
 @cache
-def world(leaves: int, seed: int, codebook: int = 1) -> World:
+def world(leaves: int, seed: int, codebook: int = 1, *, compact: bool = False) -> World:
     tree = random_tree(leaves, seed)
-    encoder = TreeEncoder(tree, PaperCodec.train(tree, codebook, words=8))
-    payload, _ = encoder.encode(np.arange(len(tree), dtype=np.int32))
-    decoded = encoder.codec.decode(payload).gaussians
+    train = CompactCodec.train if compact else PaperCodec.train
+    codec: Codec = train(tree, codebook, words=8)
+    encoder = TreeEncoder(tree, codec)
+    payload = encoder.encode(np.arange(len(tree), dtype=np.int32)).payload
+    decoded = codec.decode(payload).gaussians
     places = [SearchRequest((0.7 * i - 16.0, 0.5, 0.0), 200, 6) for i in range(PLACES)]
-    return World(tree, encoder, decoded, [flat_search(tree, place) for place in places])
+    return World(tree, SearchTree.of(tree), encoder, decoded, places)
+
+
+class CheckedClient(Client):
+    """A client that knows what should come."""
+
+    def __init__(self, where: World) -> None:
+        super().__init__()
+        self.world = where
+
+    def _from_events(self, events: Events, payload: bytes) -> _Arrival:
+        arrival = super()._from_events(events, payload)
+        merged = np.isin(arrival.fresh.ids, events.tops) & self.world.encoder.codec.merges
+        merged &= ~np.isin(arrival.fresh.ids, events.unmerged)
+        assert np.count_nonzero(merged) == arrival.merged
+        sent = arrival.fresh.take(np.flatnonzero(~merged))
+        for name in FIELDS:
+            right = getattr(self.world.decoded, name)[sent.ids]
+            assert np.array_equal(getattr(sent.gaussians, name), right)
+        return arrival
 
 
 class HostilePair:
     """A cloud and a client, and what is underway between them. Compares both at every message."""
 
     def __init__(
-        self, where: World, *, w: int, window: int, unacknowledged: tuple[int, int], whole: bool
+        self,
+        where: World,
+        *,
+        w: int = 4,
+        window: int = 32,
+        unacknowledged: tuple[int, int] = (256, 1 << 20),
+        budget: int | None = None,
+        hysteresis: float = 0.0,
     ) -> None:
         self.world = where
         self.cloud = Cloud(
             where.tree,
             where.encoder,
+            search=make_search("flat", where.hot, hysteresis=hysteresis),
             frames_per_search=w,
             reuse_window_frames=window,
+            budget_bytes=budget,
             unacknowledged=unacknowledged,
         )
-        self.client = Client()
+        self.client = CheckedClient(where)
         self.down = [self.cloud.session_start()]
         self.up: list[bytes] = []
         self.kinds: list[str] = []  # of messages sent
-        self._whole = whole  # cuts are given as they are, not as changes
+        self.merged = 0  # nodes found that the client had merged itself
+        self._budget = budget
         self._place, self._frame = PLACES // 2, 0
-        self._found: Int32 = np.empty(0, np.int32)
         nothing = np.empty(0, np.int32)
         self._states = {0: (nothing, nothing, 0)}  # of the cloud's table, by sequence number
 
@@ -76,7 +107,9 @@ class HostilePair:
         getattr(self, f"_{kind}")(number)
 
     def heal(self, *, lose_what_is_underway: bool) -> None:
-        """From now on the line works: one round trip and one search make all good."""
+        """From now on the line works: one round trip and one search make both ends equal, and where
+        the camera rests nothing stays pending.
+        """
         if self.client.table is None:
             self.down.append(self.cloud.session_start())  # the service repeats it until it arrives
             self._deliver_all()
@@ -88,9 +121,25 @@ class HostilePair:
         self._deliver_all()
         self._walk(0)
         self._deliver_all()
-        assert self.client.applied == self.cloud.sequence
+        assert self.cloud.found is not None and self.cloud.stats is not None
         assert self.client.table is not None
-        assert np.array_equal(self.client.table.cut_ids, self._found)
+        assert self.client.applied == self.cloud.sequence
+        self.settle()
+        assert np.array_equal(self.client.table.cut_ids, self.cloud.found.cut)
+
+    def settle(self) -> list[int]:
+        """Search from the same place until nothing is pending and tau is the one asked for; nodes
+        pending, search by search.
+        """
+        assert self.cloud.stats is not None
+        tau_px = self.world.places[self._place].tau_px
+        pending = [self.cloud.stats.pending]
+        while pending[-1] or self.cloud.stats.tau_px > tau_px:
+            self._search()
+            self._deliver_all()
+            pending.append(self.cloud.stats.pending)
+            assert len(pending) <= 2 * len(self.world.tree)
+        return pending
 
     def _deliver_all(self) -> None:
         while self.down:
@@ -107,25 +156,20 @@ class HostilePair:
         self._search()
 
     def _search(self) -> None:
-        cut = self.world.cuts[self._place]
         self._frame += self.cloud.table.frames_per_search
-        if self._whole:
-            message = self.cloud.send(cut, self._frame)
-        else:
-            added = difference(cut.node_ids, self._found)
-            removed = difference(self._found, cut.node_ids)
-            change = SimpleNamespace(
-                added=added,
-                removed=removed,
-                cut_size=len(cut),
-                nodes_tested=0,
-                bytes_touched=0,
-            )
-            message = self.cloud.send_change(change, self._frame)
-        self._found = cut.node_ids
-        assert self.cloud.stats is not None
-        self.kinds.append(self.cloud.stats.kind)
-        table = self.cloud.table
+        message = self.cloud.search(self.world.places[self._place], self._frame)
+        stats, found = self.cloud.stats, self.cloud.found
+        assert stats is not None and found is not None
+        table, cut = self.cloud.table, found.cut
+        self.kinds.append(stats.kind)
+        if self.cloud.sequence:
+            assert is_complete(self.world.tree, table.cut_ids)
+        assert stats.pending == np.count_nonzero(~table.in_cut(cut))
+        if stats.kind != "probe" and self._budget is None:
+            assert stats.pending == 0
+        if self._budget is not None and len(message) > self._budget:
+            events = stats.added + stats.removed
+            assert stats.kind != "step" or events <= 1 + self.world.tree.child_count.max()
         self._states[self.cloud.sequence] = table.ids, table.last, table.state_hash
         self.down.append(message)
 
@@ -209,8 +253,19 @@ class HostilePair:
         assert np.array_equal(graph._parents, self.world.tree.parent[ids])
         assert np.array_equal(graph._child_counts, self.world.tree.child_count[ids])
         held, right = graph.gaussians(np.arange(len(ids), dtype=np.int32)), self.world.decoded
+        same = np.ones(len(ids), np.bool_)
         for name in FIELDS:
-            assert np.array_equal(getattr(held, name), getattr(right, name)[ids])
+            equal = getattr(held, name) == getattr(right, name)[ids]
+            same &= equal.all(axis=tuple(range(1, equal.ndim)))
+        self.merged += int(np.count_nonzero(~same))
+        codec, true = self.world.encoder.codec, self.world.tree.gaussians.take(ids[~same])
+        if not codec.merges:
+            assert same.all()
+        elif not same.all():  # merged by the client
+            assert isinstance(codec, CompactCodec)
+            assert self.world.tree.child_count[ids[~same]].all()
+            off = np.abs(held.means[~same].astype(float) - true.means)
+            assert (off <= codec.tolerance * true.scales.max(axis=1, keepdims=True)).all()
 
 
 FAULTS = (

@@ -17,7 +17,7 @@ from lod_cloud.criterion import SearchRequest, prove_nesting
 from lod_cloud.lod_tree import LodTree
 from lod_cloud.merge import merge_leaves
 from lod_cloud.numbering import number_nodes
-from lod_cloud.split import split_order, upper_tree
+from lod_cloud.split import split_order
 from tests.lod_cloud.trees import random_scene, random_tree
 from tests.naive import lod_merge as naive
 
@@ -43,13 +43,13 @@ def test_structure_equals_naive(count: int, seed: int) -> None:
 
 
 @pytest.mark.nojit
-@given(st.integers(1, 40), st.integers(0, 9999), st.sampled_from([2, 5, 16, 64]))
+@given(st.integers(1, 40), st.integers(0, 9999), st.sampled_from([2, 5, 8, 16, 64]))
 @settings(max_examples=15, deadline=None)
-def test_groups_merge_the_cheapest_pair(count: int, seed: int, group: int) -> None:
+def test_neighbours_merge_the_cheapest_pair(count: int, seed: int, pair_within: int) -> None:
     scene = solid_scene(count, seed)
-    tree = build_tree(scene, options=BuildOptions(pair_within=group)).validate()
+    tree = build_tree(scene, options=BuildOptions(pair_within=pair_within)).validate()
     assert len(tree) == 2 * count - 1
-    assert leaves_below(tree) == naive.grouped_leaf_sets(scene, list(range(count)), group)
+    assert leaves_below(tree) == naive.paired_leaf_sets(scene, list(range(count)), pair_within)
 
 
 def solid_scene(count: int, seed: int) -> Scene:
@@ -91,8 +91,9 @@ def test_leaves_are_the_input_bit_for_bit() -> None:
         assert getattr(leaves, name).tobytes() == getattr(scene, name).tobytes()
 
 
-def test_node_spheres_follow_the_definition() -> None:
-    tree = random_tree(200, 5)
+@pytest.mark.parametrize("ratio", [1.0, 0.6])
+def test_node_spheres_follow_the_definition(ratio: float) -> None:
+    tree = build_tree(random_scene(200, 5), options=BuildOptions(fan_out_ratio=ratio))
     g = tree.gaussians
     margin = 1 + 2.0**-19
     for node in range(len(tree)):
@@ -187,9 +188,8 @@ def test_nesting_breaks_without_the_margin() -> None:
     scene = random_scene(20_000, 7)
     tree = build_tree(scene)
     assert prove_nesting(tree) == 0
-    ids, upper = split_order(scene.means, 16), upper_tree(len(scene), 16)
-    nodes, children = merge_leaves(scene, ids, upper, margin=1.0)
-    rows = number_nodes(children, upper.root, nodes.extent).nodes
+    nodes, children = merge_leaves(scene, split_order(scene.means, 16), 16, margin=1.0)
+    rows = number_nodes(children, len(nodes.means) - 1, nodes.extent).nodes
     bare = dataclasses.replace(tree, radius=nodes.radius[rows], extent=nodes.extent[rows])
     assert prove_nesting(bare) > 100
 
@@ -234,40 +234,68 @@ def masses(tree: LodTree) -> np.ndarray:
     return g.opacities.astype(float) * [naive.surface(s) for s in g.scales]
 
 
-@pytest.mark.parametrize("ratio", [1.0, 0.7])
-def test_mass_is_conserved(ratio: float) -> None:
-    """Opacity times surface of every node is that of its leaves, to 1e-5 of it."""
-    scene = random_scene(2000, 4)
-    scene.scales[:] = np.maximum(scene.scales, 0.01)
-    tree = build_tree(scene, options=BuildOptions(fan_out_ratio=ratio))
+MASS_BOUND = 2e-7  # of the mass: opacity and scales are float32, 3 times half a step
+
+
+@given(
+    st.integers(2, 600),
+    st.integers(0, 9999),
+    st.sampled_from(["solid", "discs", "needles", "mixed"]),
+    st.sampled_from([1, 16]),
+    st.sampled_from([1.0, 0.7]),
+)
+@settings(max_examples=40, deadline=None)
+def test_mass_is_conserved(
+    count: int, seed: int, shape: str, pair_within: int, ratio: float
+) -> None:
+    """Opacity times surface of every node is that of its leaves, wherever these have any."""
+    scene = random_scene(count, seed)
+    rng = np.random.default_rng(seed)
+    if shape != "mixed":
+        scene.scales[:] = np.exp(rng.normal(-2, 2, (count, 3)))
+    if shape in ("discs", "mixed"):
+        scene.scales[: count // 2, 2] = 0.0
+    if shape == "needles":
+        scene.scales[:, 1:] *= 1e-5
+    if shape == "mixed":  # lines, points and what cannot be seen, beside all the others
+        scene.scales[::7, 1:] = 0.0
+        scene.scales[::11] = 0.0
+        scene.opacities[::5] = 0.0
+    tree = build_tree(scene, options=BuildOptions(pair_within, ratio))
     mass = masses(tree)
     below = np.where(tree.child_count == 0, mass, 0.0)
     for node in range(len(tree) - 1, 0, -1):
         below[tree.parent[node]] += below[node]
-    solid = below > 1e-12
-    assert solid.sum() > 0.9 * len(tree)
-    assert np.abs(mass[solid] / below[solid] - 1).max() < 1e-5
+    some = below > 0
+    assert shape == "mixed" or some.any()
+    assert np.abs(mass[some] / below[some] - 1).max(initial=0) < MASS_BOUND
+
+
+def rows(tree: LodTree) -> np.ndarray:
+    g = tree.gaussians
+    return np.column_stack([g.means, g.quaternions, g.scales, g.opacities])
 
 
 @pytest.mark.parametrize("ratio", [0.7, 0.5])
 def test_irregular_trees_leave_small_steps_out(ratio: float) -> None:
-    scene = random_scene(4000, 12)
+    scene = solid_scene(4000, 12)
     whole = build_tree(scene)
     tree = build_tree(scene, options=BuildOptions(fan_out_ratio=ratio)).validate()
     inner = np.flatnonzero(tree.child_count)
     assert len(inner) < 0.8 * (len(scene) - 1) and tree.child_count.max() > 3
-    assert (tree.extent[inner[1:]] <= np.float32(ratio) * tree.extent[tree.parent[inner[1:]]]).all()
-    # every kept node is a node of the binary tree, with the same Gaussian and sphere
+    # every kept node is a node of the binary tree, with the same Gaussian and a tighter sphere
     assert leaves_below(tree) <= leaves_below(whole)
-    for mine, all_of_it in (
-        (tree.gaussians.means, whole.gaussians.means),
-        (tree.radius, whole.radius),
-    ):
-        assert {row.tobytes() for row in mine} <= {row.tobytes() for row in all_of_it}
+    place = {row.tobytes(): node for node, row in enumerate(rows(whole))}
+    same = np.array([place[row.tobytes()] for row in rows(tree)])
+    wide, size = whole.radius[same], whole.extent[same]
+    assert (tree.radius <= wide * (1 + 1e-6)).all() and (tree.radius[inner] < wide[inner]).any()
+    assert (tree.extent <= size * (1 + 1e-6)).all()
+    assert (size[inner[1:]] <= np.float32(ratio) * size[tree.parent[inner[1:]]]).all()
     gap = np.linalg.norm(
         tree.gaussians.means[1:].astype(float) - tree.gaussians.means[tree.parent[1:]], axis=1
     )
     assert (tree.radius[tree.parent[1:]] >= tree.radius[1:] + gap).all()
+    assert prove_nesting(tree) == 0
 
 
 @pytest.mark.parametrize("options", [{"pair_within": 0}, {"pair_within": 65}])

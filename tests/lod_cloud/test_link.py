@@ -32,3 +32,8 @@ def test_bad_links() -> None:
         Link(latency_ms=-1)
     with pytest.raises(InputError, match=">= 0 bytes"):
         Transmission(Link()).delivery_time_s(0.0, -1)
+
+
+def test_bytes_between_two_searches() -> None:
+    assert Link(rate_mbps=100).bytes_in(4 / 90) == 555_555
+    assert Link(rate_mbps=0.001).bytes_in(1 / 90) == 1

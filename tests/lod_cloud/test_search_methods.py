@@ -30,7 +30,11 @@ def ids_of(search: Search) -> list[int]:
 
 
 def compare(searches: list[Search], requests: Iterable[SearchRequest]) -> int:
-    """Let all searches answer every request like the first; returns how many there were."""
+    """Let all searches answer every request like the first; returns how many answers there were.
+
+    There must be something to compare: a request, and a second search.
+    """
+    assert len(searches) > 1
     count = 0
     for request in requests:
         results = [search.search(request) for search in searches]
@@ -41,6 +45,7 @@ def compare(searches: list[Search], requests: Iterable[SearchRequest]) -> int:
             assert np.array_equal(search.refined, searches[0].refined), where
             assert result.cut_size == results[0].cut_size, where
             count += 1
+    assert count > 0
     return count
 
 
@@ -183,7 +188,7 @@ def test_auto_searches_in_full_after_a_jump_and_then_less_and_less(
         request = SearchRequest(position, 200.0, 6.0)
         full = streaming.search(request)
         tested.append(auto.search(request).nodes_tested / full.nodes_tested)
-    assert max(tested) <= 1.2
+    assert max(tested) <= 1.3
     assert tested[0] >= 1 and tested[40] >= 1 and tested[39] < 0.2 and tested[79] < 0.2
 
 
@@ -204,7 +209,7 @@ def test_auto_takes_back_what_it_gave_up(
         results = [search.search(request) for search in searches]
         assert np.array_equal(results[0].expanded, results[1].expanded)
         assert np.array_equal(results[0].collapsed, results[1].collapsed)
-        given_up += results[1].nodes_tested > 64 and results[1].nodes_tested % 64 != 0
+        given_up += results[1].nodes_tested > 16 and results[1].nodes_tested % 16 != 0
     assert given_up > 1
 
 

@@ -22,27 +22,33 @@ def tree() -> SearchTree:
     return SearchTree.of(random_tree(600, 2, size_m=150.0))
 
 
-@pytest.mark.parametrize("camera", CAMERAS)
-@pytest.mark.parametrize("extra", [0.0, 1.0])
+@pytest.mark.parametrize("camera", [*CAMERAS, (-1e7, 0.0, 0.0)])
+@pytest.mark.parametrize("extra", [0.0, 1.0, -1.0])
+@pytest.mark.parametrize("octree", [False, True])
 def test_octree_gs_selects_what_its_rule_says(
-    tree: SearchTree, camera: tuple[float, float, float], extra: float
+    tree: SearchTree, camera: tuple[float, float, float], extra: float, octree: bool
 ) -> None:
     request = SearchRequest(camera, 929.2, 6.0)
-    ids = OctreeGsSearch(tree, extra_level=extra).select(request).node_ids
+    ids = OctreeGsSearch(tree, extra_level=extra, octree=octree).select(request).node_ids
     chosen = set(ids.tolist())
     root = float(tree.extent[0])
+    levels = np.full(len(tree), 255)  # what has no size
+    for node in range(len(tree)):
+        if octree:
+            levels[node] = 0 if node == 0 else levels[tree.parent[node]] + 1
+        elif tree.extent[node] > 0:
+            levels[node] = max(0, math.floor(math.log2(root / float(tree.extent[node]))))
     near = 0
     for node in range(len(tree)):
-        level = math.inf
-        if tree.extent[node] > 0:
-            level = max(0, math.floor(math.log2(root / float(tree.extent[node]))))
         distance = float(np.linalg.norm(tree.means[node].astype(float) - camera))
-        exact = math.log2(float(request.factor) * root / distance) + extra
+        exact = math.log2(float(request.factor) * root / distance)
         if abs(exact - round(exact)) < 1e-5:
             near += 1  # float32 may round to the other side
             continue
-        assert (node in chosen) == (level <= math.floor(exact))
-    assert near <= 2 and len(chosen) > 0 and ids.tolist() == sorted(chosen)
+        limit = math.floor(min(max(exact, 0.0), float(levels.max())) + extra)
+        assert (node in chosen) == (levels[node] <= limit)
+    assert near <= 2 and (len(chosen) > 0 or extra < 0)
+    assert ids.tolist() == sorted(chosen)
 
 
 def test_octree_gs_selects_more_than_the_cut(tree: SearchTree) -> None:

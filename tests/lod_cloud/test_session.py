@@ -19,7 +19,7 @@ from lod_cloud.cut import is_complete
 from lod_cloud.lod_tree import LodTree
 from lod_cloud.node_records import NodeRecords
 from lod_cloud.protocol import LocalProtocolError, RemoteProtocolError, seal
-from lod_cloud.search import flat_search
+from lod_cloud.search import SearchTree, flat_search, make_search
 from tests.lod_cloud.trees import random_tree, requests, walk
 from tests.naive import search as naive
 
@@ -29,7 +29,9 @@ def pair(
 ) -> tuple[Cloud, Client, PaperCodec]:
     """A session that has just started."""
     codec = PaperCodec.train(tree, 1, words=words)
-    cloud, client = Cloud(tree, codec, frames_per_search=w, reuse_window_frames=window), Client()
+    search = make_search("flat", SearchTree.of(tree))
+    cloud = Cloud(tree, codec, search=search, frames_per_search=w, reuse_window_frames=window)
+    client = Client()
     client.receive(cloud.session_start())
     return cloud, client, codec
 
@@ -46,7 +48,7 @@ def same_state(cloud: Cloud, client: Client) -> bool:
 def as_decoded(tree: LodTree, client: Client, codec: PaperCodec) -> LodTree:
     """The tree with the numbers the client would decode for every node."""
     cloud = Cloud(tree, codec)
-    payload, _ = cloud._encoder.encode(np.arange(len(tree), dtype=np.int32))
+    payload = cloud._encoder.encode(np.arange(len(tree), dtype=np.int32)).payload
     nodes = codec.decode(payload)
     return dataclasses.replace(
         tree, gaussians=nodes.gaussians, radius=nodes.radius, extent=nodes.extent
@@ -66,15 +68,15 @@ def test_tables_stay_equal_and_selections_complete(
     for index, request in enumerate(walk(seed, 25)):
         stats = client.receive(cloud.search(request, windows[0] * index))
         assert same_state(cloud, client)
-        assert cloud.cut is not None and cloud.stats is not None and client.table is not None
-        assert np.array_equal(client.table.cut_ids, cloud.cut.node_ids)
+        assert cloud.found is not None and cloud.stats is not None and client.table is not None
+        assert np.array_equal(client.table.cut_ids, cloud.found.cut)
         assert stats.payloads == cloud.stats.payloads
         moved = tuple(np.add(request.position, rng.normal(0, 1.0, 3)))
         own = SearchRequest(moved, request.focal_px, request.tau_px)
         selection = client.select(own)
         assert is_complete(tree, selection.node_ids)
         held = set(client.table.ids.tolist())
-        start = set(cloud.cut.node_ids.tolist())
+        start = set(cloud.found.cut.tolist())
         wanted = naive.finest_complete_set(decoded, start, held, own)
         assert selection.node_ids.tolist() == sorted(wanted)
         selected = decoded.gaussians.take(selection.node_ids)
@@ -121,9 +123,9 @@ def test_at_the_pose_of_the_search_only_borderline_nodes_differ(seed: int) -> No
     cloud, client, codec = pair(tree)
     for index, request in enumerate(walk(seed, 12, teleports=False)):
         client.receive(cloud.search(request, 4 * index))
-        assert cloud.cut is not None
+        assert cloud.found is not None
         selection = client.select(request)
-        differing = set(selection.node_ids.tolist()) ^ set(cloud.cut.node_ids.tolist())
+        differing = set(selection.node_ids.tolist()) ^ set(cloud.found.cut.tolist())
         for node in differing:
             above = int(tree.parent[node])
             flipped = [n for n in (node, above) if n >= 0 and tree.child_count[n]]
@@ -141,8 +143,8 @@ def test_a_node_on_the_edge_does_differ() -> None:
     edge = SearchRequest((t, 0, 0), 200, 6)
     client.receive(cloud.search(inside, 0))
     client.receive(cloud.search(edge, 4))
-    assert cloud.cut is not None
-    assert cloud.cut.node_ids.tolist() == [0]
+    assert cloud.found is not None
+    assert cloud.found.cut.tolist() == [0]
     selection = client.select(edge)
     assert selection.node_ids.tolist() == [1, 2]
     assert (selection.refined, selection.coarsened) == (1, 0)
@@ -169,10 +171,10 @@ def test_moving_back_restores_the_cut_from_what_is_held() -> None:
     far, near = SearchRequest((40, 0, 0), 300, 6), SearchRequest((39, 0, 0), 300, 6)
     client.receive(cloud.search(far, 0))
     client.receive(cloud.search(near, 4))
-    assert cloud.cut is not None
+    assert cloud.found is not None
     back = client.select(far)
     assert back.coarsened == 2
-    assert not np.array_equal(cloud.cut.node_ids, back.node_ids)
+    assert not np.array_equal(cloud.found.cut, back.node_ids)
     assert np.array_equal(back.node_ids, flat_search(tree, far).node_ids)
 
 

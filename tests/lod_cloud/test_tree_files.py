@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -15,12 +16,14 @@ import pytest
 from gaussians import parallel
 from gaussians.errors import InputError
 from gaussians.scene import FIELDS
-from lod_cloud import tree_files
+from lod_cloud import search_files, tree_files
 from lod_cloud.build import BuildOptions, build_tree, build_tree_files
 from lod_cloud.criterion import SearchRequest
 from lod_cloud.leaf_spool import LeafSpool
 from lod_cloud.lod_tree import ARRAYS
-from lod_cloud.search import flat_search
+from lod_cloud.search import SearchTree, flat_search
+from lod_cloud.search_arrays import SearchArrays
+from lod_cloud.search_files import SEARCH_FILES
 from lod_cloud.tree_files import load_tree, save_tree, verify_tree
 from tests.lod_cloud.trees import random_scene, random_tree
 
@@ -87,7 +90,7 @@ def saved(tmp_path: Path) -> Path:
     return tmp_path / "tree"
 
 
-@pytest.mark.parametrize("name", [*ARRAYS, *FIELDS])
+@pytest.mark.parametrize("name", [*ARRAYS, *FIELDS, *SEARCH_FILES])
 def test_truncated_altered_and_missing_arrays(saved: Path, name: str) -> None:
     path = saved / f"{name}.npy"
     data = path.read_bytes()
@@ -109,7 +112,7 @@ def test_damaged_descriptions(saved: Path) -> None:
     for content, message in (
         (text[: len(text) // 2], "must be JSON"),
         (text.replace('"leaves": 20', '"leaves": 21'), "checksum must match"),
-        (json.dumps(version), "version must be 1, not 99"),
+        (json.dumps(version), "version must be 1 or 2, not 99"),
         ("{}", "format must be"),
         ("[]", "format must be"),
     ):
@@ -185,6 +188,78 @@ def test_a_tree_built_into_files_is_the_one_built_in_memory(
     verify_tree(tmp_path / "by 1")
 
 
+@pytest.mark.parametrize("leaves", [1, 2, 8, 20, 500])
+def test_stored_search_arrays_are_those_made_in_memory(
+    tmp_path: Path, leaves: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(search_files, "_BLOCK_NODES", 64)
+    tree = random_tree(leaves, 4)
+    save_tree(tree, tmp_path / "tree")
+    stored = load_tree(tmp_path / "tree").search_arrays
+    made = SearchTree.of(tree)
+    assert stored is not None
+    assert np.array_equal(stored.groups.view(np.int32), made.groups.view(np.int32))
+    assert np.array_equal(stored.records.view(np.int32), made.records[1])
+    assert made.records[1].shape == (len(tree), 8)
+    verify_tree(tmp_path / "tree")
+
+
+def test_a_tree_of_version_1_has_no_search_arrays_and_is_searched_like_others(saved: Path) -> None:
+    request = SearchRequest((1, 1, 1), 100, 6)
+    cut = flat_search(load_tree(saved), request)
+    path = saved / "tree.json"
+    description = json.loads(path.read_text())
+    for name in SEARCH_FILES:
+        (saved / f"{name}.npy").unlink()
+        del description["arrays"][name]
+    for version, message in ((1, ""), (2, "must list the arrays")):
+        description["version"] = version
+        description["sha256"] = tree_files._digest(description)
+        path.write_text(json.dumps(description))
+        if message:
+            with pytest.raises(InputError, match=message):
+                load_tree(saved)
+            continue
+        tree = verify_tree(saved)
+        assert tree.search_arrays is None
+        assert np.array_equal(flat_search(tree, request).node_ids, cut.node_ids)
+
+
+def test_search_arrays_that_do_not_follow_from_the_tree_are_refused(tmp_path: Path) -> None:
+    """Whole files with right checksums, but not of this tree."""
+    tree = random_tree(20, 3)
+    for index, name in enumerate(SEARCH_FILES):
+        save_tree(tree, tmp_path / name)
+        stored = load_tree(tmp_path / name).search_arrays
+        assert stored is not None
+        path = tmp_path / name / f"{name}.npy"
+        other = np.array(stored[index])
+        other.reshape(-1)[1] += 1
+        np.save(path, other)
+        description = json.loads((tmp_path / name / "tree.json").read_text())
+        description["arrays"][name]["sha256"] = tree_files._sha256(path)
+        description["sha256"] = tree_files._digest(description)
+        (tmp_path / name / "tree.json").write_text(json.dumps(description))
+        with pytest.raises(InputError, match=f"{name}.npy: must follow from the other arrays"):
+            verify_tree(tmp_path / name)
+
+
+def test_search_arrays_of_another_tree_are_refused() -> None:
+    small, large = random_tree(20, 3), SearchTree.of(random_tree(40, 3))
+    stored = SearchArrays(large.groups, large.records[0])
+    with pytest.raises(InputError, match="search tree: stored arrays must be"):
+        SearchTree.of(dataclasses.replace(small, search_arrays=stored))
+
+
+def test_released_pages_come_back(tmp_path: Path) -> None:
+    save_tree(random_tree(500, 3), tmp_path / "tree")
+    tree = SearchTree.of(load_tree(tmp_path / "tree"))
+    before = tree.groups.copy()
+    tree.release_groups()
+    assert np.array_equal(tree.groups.view(np.int32), before.view(np.int32))
+    SearchTree.of(random_tree(5, 3)).release_groups()  # nothing is mapped
+
+
 def test_a_spool_is_filled_exactly(tmp_path: Path) -> None:
     with LeafSpool(tmp_path, 10, 1) as spool:
         spool.append(random_scene(6, 1))
@@ -201,7 +276,9 @@ import numpy as np
 from gaussians.parallel import set_threads
 from gaussians.scene import Scene
 from lod_cloud import LeafSpool, SearchRequest, build_tree_files, load_tree
-from lod_cloud.search import flat_search
+from lod_cloud.search import SearchTree, flat_search
+from lod_cloud.search_arrays import SearchArrays
+from lod_cloud.search_files import SEARCH_FILES
 from tests.lod_cloud.trees import random_scene
 
 def peak_mb():

@@ -33,26 +33,27 @@ def leaf_sets(scene: Scene, ids: list[int]) -> set[frozenset[int]]:
     return {frozenset(ids)} | left | right
 
 
-def grouped_leaf_sets(scene: Scene, ids: list[int], group: int) -> set[frozenset[int]]:
-    """The leaves below every node, where groups of at most ``group`` merge the cheapest pair."""
-    if len(ids) <= group:
-        return _paired_leaf_sets(scene, ids)
-    ordered = leaf_order(scene, ids)
-    half = len(ids) // 2
-    left = grouped_leaf_sets(scene, ordered[:half], group)
-    right = grouped_leaf_sets(scene, ordered[half:], group)
-    return {frozenset(ids)} | left | right
+def paired_leaf_sets(scene: Scene, ids: list[int], pair_within: int) -> set[frozenset[int]]:
+    """The leaves below every node, where the cheapest of ``pair_within`` neighbours merge."""
+    found = {frozenset([i]) for i in ids}
 
+    def merge_down(slots: list[frozenset[int]], leave: int) -> list[frozenset[int]]:
+        while len(slots) > leave:
+            pairs = [(a, b) for i, a in enumerate(slots) for b in slots[:i]]
+            a, b = min(pairs, key=lambda pair: _pair_cost(scene, *pair))
+            slots = [s for s in slots if s not in (a, b)] + [a | b]
+            found.add(a | b)
+        return slots
 
-def _paired_leaf_sets(scene: Scene, ids: list[int]) -> set[frozenset[int]]:
-    """Sum of the principal 2 x 2 minors of the merge, times (1 + |colour difference|^2)^2."""
-    slots = [frozenset([i]) for i in ids]
-    found = set(slots)
-    while len(slots) > 1:
-        pairs = [(a, b) for i, a in enumerate(slots) for b in slots[:i]]
-        a, b = min(pairs, key=lambda pair: _pair_cost(scene, *pair))
-        slots = [s for s in slots if s not in (a, b)] + [a | b]
-        found.add(a | b)
+    def reduced(ids: list[int]) -> list[frozenset[int]]:
+        slots = [frozenset([i]) for i in ids]
+        if len(ids) > pair_within:
+            ordered = leaf_order(scene, ids)
+            half = len(ids) // 2
+            slots = reduced(ordered[:half]) + reduced(ordered[half:])
+        return merge_down(slots, max(1, pair_within // 2))
+
+    merge_down(reduced(ids), 1)
     return found
 
 

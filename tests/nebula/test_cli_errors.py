@@ -34,6 +34,7 @@ COMMANDS = {
     "convert": (["in.sog", "out.ply"], "ConvertOptions"),
     "build-tree": (["--out", "tree"], "BuildTreeOptions"),
     "search": (["--tree", "tree"], "SearchOptions"),
+    "stream": ([], "StreamOptions"),
     "area": ([], "AreaOptions"),
     "energy": ([], "EnergyOptions"),
     "figure": (["formats", "--out", "figures"], "FigureOptions"),

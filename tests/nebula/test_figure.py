@@ -35,9 +35,12 @@ def options(name: str, out: Path, config: str | None = None, **given: Any) -> Fi
     return FigureOptions(name, config, given, seed=1, baseline_m=0.06, out=out)
 
 
-@pytest.fixture(scope="module", params=FIGURES)
+VIEW_FIGURES = [name for name, kind in FIGURES.items() if "tree" not in kind.takes]
+
+
+@pytest.fixture(scope="module", params=VIEW_FIGURES)
 def made(request: Any, tmp_path_factory: Any) -> tuple[str, Path, dict[str, Any]]:
-    """Every figure on a small city: its name, where it was written, what it returned."""
+    """Every figure of views on a small city: its name, where it was written, what it returned."""
     out = tmp_path_factory.mktemp("figure")
     return request.param, out, figure.run(options(request.param, out, **SMALL)).data
 
@@ -90,7 +93,31 @@ def test_rows_of_different_keys_share_one_header():
 
 def test_help_lists_the_figures():
     shown = CliRunner().invoke(cli, ["figure", "--help"]).output
-    assert all(f"{name} " in shown and about in shown for name, (_, about) in FIGURES.items())
+    assert all(f"{name} " in shown and kind.about in shown for name, kind in FIGURES.items())
+
+
+@pytest.mark.parametrize(
+    ("name", "option", "flag"),
+    [
+        ("formats", {"tree": Path("x")}, "--tree"),
+        ("stereo-similarity", {"tau_px": 0.0}, "--tau"),
+        ("frame-interval", {"search_every": 4}, "--every"),
+        ("lod-search", {"shrink": 2}, "--shrink"),
+        ("format-widths", {"frames": 7}, "--frames"),
+    ],
+)
+def test_an_option_a_figure_has_no_use_for_is_refused(tmp_path, name, option, flag):
+    with pytest.raises(InputError, match=f"figure {name}: {flag}: not of use here"):
+        figure.run(replace(options(name, tmp_path / "out", **SMALL), **option))
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "flag"),
+    [("formats", {"trace": "walk"}, "--trace"), ("lod-search", {"near_m": 0.1}, "--near")],
+)
+def test_a_placement_a_figure_has_no_use_for_is_refused(tmp_path, name, given, flag):
+    with pytest.raises(InputError, match=f"figure {name}: {flag}: not of use here"):
+        figure.run(options(name, tmp_path / "out", **given, **SMALL))
 
 
 def test_an_unknown_figure_is_refused_with_the_known_ones(tmp_path):

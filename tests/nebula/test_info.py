@@ -139,12 +139,19 @@ def test_a_tree_directory_is_described(tmp_path: Path, capsys) -> None:
     data = info(tmp_path / "tree")
     assert (data["leaves"], data["nodes"], data["nesting_violations"]) == (1000, 1999, 0)
     assert data["fan_out"] == {"0": 1000, "2": 999}
-    assert sum(data["level_nodes"]) == 1999 and len(data["level_nodes"]) == data["levels"]
+    assert data["fan_out_max"] == 2 and data["interior"] == "merged"
+    assert sum(data["level_nodes"]) == 1999 and sum(data["level_leaves"]) == 1000
+    sizes = data["level_median_extent_m"]
+    assert len(data["level_nodes"]) == len(sizes) == data["levels"] and sizes[0] == max(sizes)
+    assert 0 < data["opacities_above_one"] == round(999 * data["opacities_above_one_share"]) < 999
     files = list((tmp_path / "tree").iterdir())
     assert data["bytes_on_disk"] == sum(f.stat().st_size for f in files)
     capsys.readouterr()
     assert run_main(str(tmp_path / "tree")) == 0
-    assert "nesting: 0 violations on 1998 edges" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert "nesting: 0 violations on 1998 edges" in text
+    assert "interior nodes: merged from their children" in text
+    assert f"      0           1           0  {sizes[0]:.4g}\n" in text
     assert run_main(str(tmp_path / "tree"), "--up", "-y") == 2
     assert "a tree knows its up axis and units" in capsys.readouterr().err
 

@@ -19,6 +19,7 @@ from nebula.options import (
     SceneOptions,
     SearchOptions,
 )
+from nebula.program import main
 
 DISPLAY = Display.from_fov(80, 64, 96.0)
 SCENE = SceneOptions(GeneratedCity(2000), None, None, 1.0, None, 0.2, DISPLAY, "walk")
@@ -98,7 +99,7 @@ def test_the_command_line_reaches_the_options(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(search, "run", note)
     line = "search --tree t --every 2 --method wheel --compare --hysteresis 0.02 --tau 15"
     with pytest.raises(SystemExit):
-        cli.main(line.split())
+        main(line.split())
     assert seen[0].search_every == 2 and seen[0].method == "wheel" and seen[0].compare
     assert math.isclose(seen[0].hysteresis, 0.02) and seen[0].frames is None
 

@@ -176,3 +176,17 @@ def test_compiled_and_interpreted_kernels_give_the_same_bits(tmp_path):
     for name in ("left.png", "right.png"):
         images = [(tmp_path / kind / name).read_bytes() for kind in ("jit", "nojit")]
         assert images[0] == images[1]
+
+
+def test_paced_messages_stay_within_the_link(plain, tmp_path):
+    """A slow link brings the first picture in parts; the report says what was pending."""
+    paced = run(options(tmp_path, paced=True, rate_mbps=8.0, frames=8)).data
+    pacing, stream = paced["stream"]["pacing"], paced["stream"]
+    assert plain[0]["stream"]["pacing"] == {}
+    assert pacing["budget_bytes"] == int(2 / 90 * 1e6)
+    assert (
+        max(stream["message_bytes"]) <= pacing["budget_bytes"] < plain[0]["stream"]["initial_bytes"]
+    )
+    assert len(pacing["pending_nodes"]) == len(pacing["tau_px"]) == 4
+    assert pacing["pending_nodes"][0] > 0 and pacing["deferred_bytes"][0] > 0
+    assert "nodes pending, most" in (tmp_path / "report.html").read_text(encoding="utf-8")

@@ -1,0 +1,207 @@
+"""The buckets of the timing wheel: when an entry is due, and where it waits until then.
+
+**When a decision can change.** A node was found (not) refined at camera c0, distance D from its
+centre, with threshold t. In float32 the test compares D^2 with an error of at most 5 roundings
+and t^2 with one, so ``|D - t| > t 2^-22`` suffices for the test to agree with real numbers; we
+allow twice that (``_SLACK``). Let v be the way from c0 to a later camera.
+
+* *Not refined* (D > t): the new distance is at least ``D - w.v``, where w points from c0 to the
+  node. Nothing changes before w.v reaches ``D - t``.
+* *Refined* (D < t): the new distance squared is ``D^2 + 2 D w.v + |v|^2``, w pointing away.
+
+The hand of a sector (see `lod_cloud.search.sectors`) is a running bound on w.v for all w of that
+sector. Hands of the second kind advance by ``max(reach + KAPPA, KAPPA) |step|``: when such a hand
+has advanced by x, the path P is at most x / KAPPA and w.v at most x - KAPPA P. The distance squared
+is then at most ``D^2 + 2 D (x - KAPPA P) + P^2``, convex in P and so largest at P = 0 or at
+P = x / KAPPA. So nothing changes before x = min((t^2 - D^2) / 2 D, KAPPA sqrt(t^2 - D^2)); nor
+before P = t - D: one more hand advances by the length of the path. An entry goes to that of the
+two hands which will take longer if the camera goes on as it did last.
+
+**Buckets.** A hand at K pops every entry of key <= K. Near keys go to fine buckets, far ones to
+coarse buckets popped when the hand enters them. Both are rings: what lies more than one turn ahead
+is popped early, which only costs a test. Decisions within the slack are popped at every search.
+A bucket is a list of chunks of 15 ids; ``heads`` holds 16 times the first chunk plus the ids in
+it (the others are full), or -1.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from lod_cloud.search.marks import ONE, is_set, longer
+from lod_cloud.search.prefetching import prefetch
+from lod_cloud.search.sectors import SECTORS, reach, sector_of
+from lod_cloud.search_arrays import RECORD_COLUMNS
+
+KAPPA = 0.2
+HANDS = 2 * SECTORS + 1  # hand 2 j + kind belongs to sector j; the last one moves with the path
+FINE_M, FINE = 2.0**-7, 8  # width and number of fine buckets of a hand: one coarse bucket
+COARSE_M, COARSE = 2.0**-4, 512
+RING = FINE + COARSE
+BUCKETS = HANDS * RING + 1  # the last one is popped at every search
+PER_CHUNK = 15  # node ids in a chunk of 64 bytes; its first number is the next chunk
+FREE, USED = 0, 1  # places in ``counts``: first free chunk, chunks ever used
+_SLACK = 2.0**-21
+_TINY = 1e-15  # metres; squares of less may vanish in float32
+_BATCH = 256
+_AHEAD, _NEAR = 24, 12  # nodes whose numbers, and whose chunks, are asked for in advance
+
+
+@njit(forceinline=True)
+def _bucket(hands, rates, refined, dx, dy, dz, t):  # type: ignore[no-untyped-def]
+    """Bucket of a node seen from (dx, dy, dz) away (camera minus centre), threshold t."""
+    d2 = dx * dx + dy * dy + dz * dz
+    d = np.sqrt(d2)
+    slack = t * _SLACK + _TINY
+    margin = (t - d if refined else d - t) - slack
+    if margin <= 0.0 or d == 0.0:
+        return BUCKETS - 1
+    if refined:
+        inner = t - slack
+        room = inner * inner - d2
+        straight = min(room / (2.0 * d), KAPPA * np.sqrt(room))
+        hand = 2 * sector_of(dx, dy, dz) + 1
+        if straight > margin * rates[hand]:
+            margin = straight
+        else:
+            hand = HANDS - 1
+    else:
+        hand = 2 * sector_of(-dx, -dy, -dz)
+    now = hands[hand]
+    # the differences above and the sum below are good to 1e-15 of the larger number
+    farthest = now + 2.0 * COARSE * COARSE_M
+    key = min(now + margin * (1.0 - 1e-9) - abs(now) * 1e-15, farthest)
+    if key <= now:
+        return BUCKETS - 1
+    fine = int(np.floor(key * (1.0 / FINE_M)))
+    if fine - int(np.floor(now * (1.0 / FINE_M))) < FINE:
+        return hand * RING + (fine & (FINE - 1))
+    here = int(np.floor(now * (1.0 / COARSE_M)))
+    coarse = min(int(np.floor(key * (1.0 / COARSE_M))), here + COARSE - 1)
+    return hand * RING + FINE + (coarse & (COARSE - 1))
+
+
+@njit
+def _set_rates(step, length, rates, axes, cosines, sines):  # type: ignore[no-untyped-def]
+    """How far every hand advances per metre of a step."""
+    rates[HANDS - 1] = 1.0
+    for j in range(SECTORS):
+        along = axes[j, 0] * step[0] + axes[j, 1] * step[1] + axes[j, 2] * step[2]
+        advance = reach(along / length, cosines[j], sines[j])
+        rates[2 * j] = advance
+        rates[2 * j + 1] = max(advance + KAPPA, KAPPA)
+
+
+@njit(forceinline=True)
+def _take(bucket, heads, chunks, taken, count):  # type: ignore[no-untyped-def]
+    """Empty a bucket and note its first chunk; the number of those noted."""
+    head = heads[bucket]
+    if head >= 0:
+        prefetch(chunks, np.intp(head >> 4) * (PER_CHUNK + 1))
+        taken[count] = head
+        heads[bucket] = -1
+        count += 1
+    return count
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def collect(step, hands, rates, heads, counts, chunks, axes, cosines, sines):  # type: ignore[no-untyped-def]
+    """Move the hands by a step and return the nodes whose entries are due.
+
+    Their entries are gone, their ``scheduled`` marks stay.
+    """
+    taken = np.empty(1024, np.int32)
+    count = _take(BUCKETS - 1, heads, chunks, taken, 0)
+    length = np.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
+    if length > 0.0:
+        _set_rates(step, length, rates, axes, cosines, sines)
+    for hand in range(HANDS if length > 0.0 else 0):
+        before = hands[hand]
+        now = before + (rates[hand] + 1e-12) * length
+        now += (abs(now) + abs(before)) * 2.3e-16
+        hands[hand] = now
+        if now <= before:
+            continue
+        if hand + 4 < HANDS:
+            later = np.intp(np.floor(hands[hand + 4] * (1.0 / FINE_M)))
+            prefetch(heads, (hand + 4) * RING + (later & (FINE - 1)))
+        first = np.intp(np.floor(before * (1.0 / FINE_M)))
+        last = min(np.intp(np.floor(now * (1.0 / FINE_M))), first + FINE - 1)
+        from_coarse = np.intp(np.floor(before * (1.0 / COARSE_M))) + 1
+        to_coarse = min(np.intp(np.floor(now * (1.0 / COARSE_M))), from_coarse + COARSE - 1)
+        if count + FINE + COARSE > len(taken):
+            taken = longer(taken, FINE + COARSE)
+        for fine in range(first, last + 1):
+            bucket = hand * RING + (fine & (FINE - 1))
+            count = _take(bucket, heads, chunks, taken, count)
+        for coarse in range(from_coarse, to_coarse + 1):
+            bucket = hand * RING + FINE + (coarse & (COARSE - 1))
+            count = _take(bucket, heads, chunks, taken, count)
+    return _release(counts, chunks, taken[:count])
+
+
+@njit
+def _release(counts, chunks, taken):  # type: ignore[no-untyped-def]
+    """The node ids in the buckets that began with these chunks; their chunks become free."""
+    due = np.empty(PER_CHUNK * (len(taken) + 64), np.int32)
+    found = 0
+    for head in taken:
+        chunk, held = head >> 4, head & 15
+        while chunk >= 0:
+            if found + PER_CHUNK > len(due):
+                due = longer(due, PER_CHUNK)
+            for j in range(1, held + 1):
+                due[found] = chunks[chunk, j]
+                found += 1
+            below = chunks[chunk, 0]
+            chunks[chunk, 0] = counts[FREE]
+            counts[FREE] = chunk
+            chunk = below
+            held = np.int32(PER_CHUNK)
+    return due[:found]
+
+
+@njit(forceinline=True)
+def _bucket_of(node, cx, cy, cz, k, grow, floats, refined, hands, rates):  # type: ignore[no-untyped-def]
+    was = is_set(refined, node)
+    scale = grow if was else ONE
+    t = scale * floats[node, 3] + (scale * k) * floats[node, 4]
+    dx = np.float64(cx) - np.float64(floats[node, 0])
+    dy = np.float64(cy) - np.float64(floats[node, 1])
+    dz = np.float64(cz) - np.float64(floats[node, 2])
+    return _bucket(hands, rates, was, dx, dy, dz, np.float64(t))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def insert(nodes, cx, cy, cz, k, grow, floats, refined, hands, rates, heads, counts, chunks):  # type: ignore[no-untyped-def]
+    """Make an entry for each node, whose decision is known. There must be chunks enough for all.
+
+    In batches: the buckets of all of a batch are found first, so that they can be asked for.
+    """
+    buckets = np.empty(_BATCH, np.intp)
+    for begin in range(0, len(nodes), _BATCH):
+        batch = nodes[begin : begin + _BATCH]
+        for i in range(len(batch)):
+            if begin + i + _AHEAD < len(nodes):
+                prefetch(floats, np.intp(nodes[begin + i + _AHEAD]) * RECORD_COLUMNS)
+            bucket = _bucket_of(batch[i], cx, cy, cz, k, grow, floats, refined, hands, rates)
+            buckets[i] = bucket
+            prefetch(heads, bucket)
+        for i in range(len(batch)):
+            if i + _NEAR < len(batch):
+                later = max(heads[buckets[i + _NEAR]], 0) >> 4
+                prefetch(chunks, np.intp(later) * (PER_CHUNK + 1))
+            head = heads[buckets[i]]
+            if head < 0 or head & 15 == PER_CHUNK:
+                fresh = counts[FREE]
+                if fresh >= 0:
+                    counts[FREE] = chunks[fresh, 0]
+                else:
+                    fresh = counts[USED]
+                    counts[USED] += 1
+                chunks[fresh, 0] = head >> 4
+                head = fresh << 4
+            head += 1
+            chunks[head >> 4, head & 15] = batch[i]
+            heads[buckets[i]] = head

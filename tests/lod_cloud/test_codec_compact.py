@@ -1,0 +1,262 @@
+"""The compact codec: stated errors, escapes, positions that no history changes, merged nodes."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gaussians import parallel
+from gaussians.codebook import AC_ERROR
+from gaussians.scene import FIELDS
+from lod_cloud.build import BuildOptions, build_tree
+from lod_cloud.codec import CompactCodec, Encoded, References, read_codec
+from lod_cloud.codec.axes import sorted_axes
+from lod_cloud.codec.tolerance import CODED_MASS_ERROR
+from lod_cloud.criterion import SearchRequest
+from lod_cloud.lod_tree import LodTree
+from lod_cloud.node_records import NodeRecords
+from lod_cloud.protocol import RemoteProtocolError
+from lod_cloud.search import SearchTree
+from lod_cloud.tree_encoder import TreeEncoder
+from tests.lod_cloud.hostile_link import HostilePair, World
+from tests.lod_cloud.trees import random_scene, random_tree
+
+SEEDS = st.integers(0, 999)
+
+
+def coded(tree: LodTree, codec: CompactCodec, ids: np.ndarray) -> tuple[NodeRecords, Encoded]:
+    """What arrives of these nodes when nothing is known."""
+    encoded = TreeEncoder(tree, codec).encode(ids.astype(np.int32))
+    assert sum(encoded.columns.values()) == len(encoded.payload)
+    return codec.decode(encoded.payload), encoded
+
+
+def masses(nodes: NodeRecords) -> np.ndarray:
+    a, b, c = nodes.gaussians.scales.astype(float).T
+    return np.asarray(nodes.gaussians.opacities * (a * b + a * c + b * c))
+
+
+@given(st.integers(1, 200), SEEDS, st.sampled_from([0, 1, 3]))
+@settings(max_examples=25)
+def test_round_trip(count: int, seed: int, sh_degree: int) -> None:
+    tree = random_tree(count, seed, sh_degree=sh_degree)
+    codec = CompactCodec.train(tree, seed, words=16)
+    ids = np.flatnonzero(np.random.default_rng(seed).random(len(tree)) < 0.6).astype(np.int32)
+    decoded, encoded = coded(tree, codec, ids)
+    original = NodeRecords.of(tree, ids)
+    for name in ("ids", "parents", "child_counts"):
+        assert np.array_equal(getattr(decoded, name), getattr(original, name))
+    old, new = original.gaussians, decoded.gaussians
+    off = np.abs(new.means.astype(float) - old.means)
+    assert (
+        off <= codec.position.max_error * old.scales.max(axis=1, keepdims=True, initial=0)
+    ).all()
+    assert np.abs(masses(decoded) - masses(original)).max(initial=0) <= (
+        CODED_MASS_ERROR * masses(original).max(initial=0)
+    )
+    assert (np.abs(masses(decoded) - masses(original)) <= 0.0901 * masses(original)).all()
+    assert np.abs(new.sh[:, 1:] - old.sh[:, 1:]).max(initial=0) <= AC_ERROR
+    assert np.abs(new.sh[:, 0].astype(float) - old.sh[:, 0]).max(initial=0) <= codec.dc.max_error
+    assert (decoded.radius >= original.radius).all()
+    assert (decoded.extent >= original.extent).all()
+    assert encoded.sent == len(ids)
+
+
+def covariances(scales: np.ndarray, quaternions: np.ndarray) -> np.ndarray:
+    w, x, y, z = quaternions.astype(float).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    axes = np.moveaxis(np.array(rows), 2, 0) * scales[:, None, :]
+    return np.asarray(axes @ np.swapaxes(axes, 1, 2))
+
+
+def test_axes_in_another_order_are_the_same_gaussian() -> None:
+    scene = random_scene(300, 4)
+    scales, quaternions = sorted_axes(scene.scales, scene.quaternions)
+    assert (np.diff(scales, axis=1) <= 0).all()
+    before = covariances(scene.scales.astype(float), scene.quaternions)
+    assert np.abs(covariances(scales, quaternions) - before).max() <= 1e-6 * scales.max() ** 2
+
+
+@given(SEEDS, st.sampled_from([5, 8]))
+@settings(max_examples=30)
+def test_any_reference_within_the_tolerance_gives_the_same_bits(seed: int, bits: int) -> None:
+    tree = random_tree(80, seed)
+    codec = CompactCodec.train(tree, 1, words=8, position_bits=bits)
+    encoder = TreeEncoder(tree, codec)
+    rng = np.random.default_rng(seed)
+    ids = np.arange(len(tree), dtype=np.int32)
+    right = coded(tree, codec, ids)[0].gaussians
+    near = rng.integers(0, len(tree), len(tree))  # any node will do
+    scene = tree.gaussians
+    references = References(scene.means[near], scene.scales[near].max(axis=1))
+    nodes = NodeRecords.of(tree, ids)
+    words, good = codec.assign_words(tree, ids)
+    sent = codec.encode(nodes, words, good, places=False, references=references)
+    share = rng.choice([-1.0, -0.999, 0.0, 0.999, 1.0], (len(tree), 3))
+    moved = references.means + share * codec.tolerance * references.sigmas[:, None]
+    towards = np.where(share < 0, np.inf, -np.inf)
+    clients = np.nextafter(moved.astype(np.float32), towards.astype(np.float32))
+    got = codec.decode(sent.payload, (ids, tree.parent), clients).gaussians
+    for name in FIELDS:
+        assert np.array_equal(getattr(got, name), getattr(right, name))
+    assert encoder.codec is codec
+
+
+def world_of(tree: LodTree, codec: CompactCodec, seed: int) -> World:
+    encoder = TreeEncoder(tree, codec)
+    everything = encoder.encode(np.arange(len(tree), dtype=np.int32))
+    rng = np.random.default_rng(seed)
+    step, position = rng.uniform(0.1, 1.5), rng.uniform(-5, 5, 3)
+    places = []
+    for _ in range(48):
+        position = position + rng.normal(0, step, 3)
+        places.append(SearchRequest(tuple(position), 200, 6))
+    decoded = codec.decode(everything.payload).gaussians
+    return World(tree, SearchTree.of(tree), encoder, decoded, places)
+
+
+@given(
+    st.integers(2, 150),
+    st.integers(0, 30),
+    st.sampled_from([1.0, 0.5]),
+    st.sampled_from([0, 4, 32]),
+    st.sampled_from([None, 300]),
+    st.lists(st.sampled_from(["walk", "walk", "walk", "teleport", "lose", "back"]), max_size=40),
+)
+@settings(max_examples=40)
+def test_no_history_changes_what_is_decoded(
+    count: int, seed: int, ratio: float, window: int, budget: int | None, path: list[str]
+) -> None:
+    """Collapses, expansions, repairs and jumps: what is sent is decoded as if nothing had been held
+    (asserted at every message), and what is merged stays within the tolerance.
+    """
+    scene = random_scene(count, seed)
+    scene.scales[:] = np.maximum(scene.scales, 1e-3)
+    scene.opacities[:] = np.maximum(scene.opacities, 0.05)
+    tree = build_tree(scene, options=BuildOptions(fan_out_ratio=ratio))
+    pair = HostilePair(
+        world_of(tree, CompactCodec.train(tree, 1, words=8), seed), window=window, budget=budget
+    )
+    for number, step in enumerate(path):
+        place = 7 * number if step == "teleport" else (number if step != "back" else number // 3)
+        pair.act(("teleport", place))
+        pair.act(("lose_down" if step == "lose" else "down", 0))
+        for _ in range(2):
+            pair.act(("down", 0))
+            pair.act(("up", 0))
+    pair.heal(lose_what_is_underway=False)
+
+
+def test_collapsed_nodes_are_merged_not_sent() -> None:
+    scene = random_scene(150, 3)
+    scene.scales[:] = np.maximum(scene.scales, 1e-3)
+    scene.opacities[:] = np.maximum(scene.opacities, 0.05)
+    tree = build_tree(scene)
+    pair = HostilePair(world_of(tree, CompactCodec.train(tree, 1, words=8), 3), window=0)
+    merged = payloads = 0
+    for place in [*range(48), *range(47, -1, -1)]:
+        for action in (("teleport", place), ("down", 0), ("down", 0), ("up", 0)):
+            pair.act(action)
+        stats = pair.cloud.stats
+        assert stats is not None
+        merged, payloads = merged + stats.merged, payloads + stats.payloads
+    assert merged > 0.15 * payloads
+    assert pair.merged > 0
+
+
+def test_interior_nodes_that_are_no_merges_are_sent() -> None:
+    """A tree that does not say that it merged, and one that says so but does not."""
+    tree = random_tree(60, 2)
+    foreign = dataclasses.replace(tree.metadata, build={"merge": "trained"})
+    codec = CompactCodec.train(dataclasses.replace(tree, metadata=foreign), 1, words=8)
+    assert not codec.merges
+    tree.gaussians.means[tree.child_count > 0] += 0.5
+    lying = CompactCodec.train(tree, 1, words=8)
+    assert lying.merges
+    for one in (codec, lying):
+        pair = HostilePair(world_of(tree, one, 2), window=0)
+        for place in range(48):
+            for action in (("teleport", place), ("down", 0), ("down", 0), ("up", 0)):
+                pair.act(action)
+            assert pair.cloud.stats is not None
+            assert pair.cloud.stats.merged == 0
+        assert pair.merged == 0
+
+
+def test_the_tolerance_is_what_the_text_says() -> None:
+    codec = CompactCodec.train(random_tree(100, 1), 1, words=8)
+    assert codec.position.max_error == 1 / 64
+    assert 0.2 < codec.tolerance < 0.33
+    assert dataclasses.replace(codec, merge_levels=31).tolerance < 0.33
+
+
+def test_parameters_round_trip() -> None:
+    codec = CompactCodec.train(random_tree(200, 4), 1, words=16, stages=3, colour_bits=10)
+    same = read_codec(codec.to_bytes())
+    assert isinstance(same, CompactCodec)
+    assert same.version == codec.version
+    assert same.to_bytes() == codec.to_bytes()
+    with pytest.raises(RemoteProtocolError, match="codec must be one of compact, paper"):
+        read_codec(codec.to_bytes().replace(b'"compact"', b'"compost"'))
+    with pytest.raises(RemoteProtocolError):
+        read_codec(codec.to_bytes()[:-1])
+    with pytest.raises(RemoteProtocolError, match="must be complete"):
+        read_codec(codec.to_bytes().replace(b'"dc"', b'"cd"'))
+
+
+@pytest.mark.parametrize("colour_bits", [8, 10])
+def test_damaged_payloads_are_refused(colour_bits: int) -> None:
+    tree = random_tree(30, 5)
+    codec = CompactCodec.train(tree, 1, words=8, colour_bits=colour_bits)
+    payload = coded(tree, codec, np.arange(len(tree)))[1].payload
+    with pytest.raises(RemoteProtocolError):
+        codec.decode(payload[:-1])
+    with pytest.raises(RemoteProtocolError):
+        codec.decode(payload + b"\0")
+    for position in range(0, len(payload), 3):
+        damaged = bytearray(payload)
+        damaged[position] ^= 0xFF
+        with contextlib.suppress(RemoteProtocolError):
+            codec.decode(bytes(damaged))
+
+
+VERSION_OF_A_TREE = """
+from lod_cloud import CompactCodec, PaperCodec
+from gaussians import parallel
+from tests.lod_cloud.trees import random_tree
+parallel.set_threads({threads})
+tree = random_tree(600, 6, sh_degree=2)
+print(CompactCodec.train(tree, 5).version, PaperCodec.train(tree, 5, words=64).version)
+"""
+
+
+def test_training_gives_the_same_bits_in_every_process_and_on_any_number_of_threads() -> None:
+    found = {
+        subprocess.run(
+            [sys.executable, "-c", VERSION_OF_A_TREE.format(threads=threads)],
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout
+        for threads in (1, 2)
+    }
+    assert len(found) == 1
+    before = parallel.threads()
+    try:
+        parallel.set_threads(3)
+        tree = random_tree(600, 6, sh_degree=2)
+        own = CompactCodec.train(tree, 5).version
+    finally:
+        parallel.set_threads(before)
+    assert found.pop().split()[0] == str(own)
