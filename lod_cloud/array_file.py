@@ -33,7 +33,7 @@ class ArrayFile:
             }
             np.lib.format.write_array_header_1_0(file, header)
             self._start = file.tell()
-            file.truncate(self._start + self.dtype.itemsize * math.prod(shape))
+            _allocate(file.fileno(), self._start + self.dtype.itemsize * math.prod(shape))
         self._file = path.open("r+b", buffering=0)
         self._buffers = threading.local()
         self._lock = threading.Lock()
@@ -86,6 +86,16 @@ class ArrayFile:
         yield
         with self._lock:
             self.seconds += time.perf_counter() - begin
+
+
+def _allocate(file: int, size: int) -> None:
+    """Make a file this long. A full disk is noticed here, and filling reserved blocks took ext4 a
+    tenth of the time that filling a hole takes.
+    """
+    if size and hasattr(os, "posix_fallocate"):  # not on every platform
+        os.posix_fallocate(file, 0, size)
+    else:
+        os.truncate(file, size)
 
 
 def release_pages(array: NDArray[Any]) -> None:

@@ -26,6 +26,7 @@ from lod_cloud.moments import surface
 from lod_cloud.numbering import Numbering
 
 _CLUMP = 1 << 15  # nodes
+_RELEASED = 4  # clumps whose leaves may stay mapped
 
 
 class Rows(Protocol):
@@ -70,15 +71,16 @@ def merge_harmonics(
 
     def fill_clumps(begin: int, end: int) -> None:
         buffer = np.empty((_CLUMP, width), np.float32)
-        for low, high in clumps[begin:end]:
-            ranges = _ranges(numbering.parent, low, high)
+        for place in range(begin, end):
+            if place % _RELEASED == 0:
+                release()
+            ranges = _ranges(numbering.parent, *clumps[place])
             free, below, children = 0, 0, buffer[:0]
             for low, high in reversed(ranges):
                 rows = buffer[free : free + high - low]
                 fill(low, high, below, children, rows)
                 out.write(low, rows)
                 free, below, children = free + high - low, low, rows
-        release()
 
     run_chunks(fill_clumps, len(clumps))
     row = np.empty((1, width), np.float32)
