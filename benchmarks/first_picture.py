@@ -123,8 +123,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--tau", type=float, default=6.0, metavar="PX")
     parser.add_argument("--jump", type=float, default=100.0, metavar="M", help="along the path")
     parser.add_argument("--most-searches", type=int, default=300)
-    parser.add_argument("--words", type=int, default=256)
-    parser.add_argument("--stages", type=int, default=2)
+    parser.add_argument("--words", type=int, help="of the codebook, if not the codec's own")
+    parser.add_argument("--stages", type=int)
     parser.add_argument("--json", type=Path, metavar="FILE")
     given = parser.parse_args(arguments)
     set_threads(1)
@@ -135,7 +135,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     results = {}
     for name in given.codec or ["paper", "compact"]:
         train = PaperCodec.train if name == "paper" else CompactCodec.train
-        codec = train(tree, 0, words=given.words, stages=given.stages)
+        sizes = {"words": given.words, "stages": given.stages}
+        codec = train(tree, 0, **{key: size for key, size in sizes.items() if size is not None})
         results[name] = measure(tree, hot, codec, link, given.jump, given)
         print("\n".join(lines(name, results[name], link)), flush=True)
     if given.json:

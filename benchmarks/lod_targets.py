@@ -1,4 +1,4 @@
-"""What the LoD searches are held to (DESIGN, section 11), and whether a measurement passes.
+"""What the cloud side is held to, and whether a measurement passes.
 
 Times on one thread are CPU times, so that another process does not change the verdict; what is
 measured on two threads is wall time. A tree has targets by its size and by how many nodes a metre
@@ -16,6 +16,10 @@ METRES_PER_FRAME = 1.4 / 90  # walking
 FLAT_NS_PER_NODE = 3.5  # slower than this the baseline would flatter everything else
 GROWTH = 1.3
 WORST_OF_STREAMING = 1.5
+FULL_SIZE = 20_000_000  # leaves of the trees the rates are meant for
+RATES_MBPS = {"city, walk": 1.3, "dense_city, walk": 12.0, "dense_city, head": 0.5}
+DECODED_DB = 44.0  # 0.1 dB at 27.7 dB against the ground truth
+PICTURES_MS = {120.0: 60.0, 60.0: 200.0}  # by tau in px, at 100 Mbps
 
 Row = dict[str, Any]
 
@@ -42,6 +46,11 @@ class Verdict:
     def as_row(self) -> Row:
         """For JSON."""
         return asdict(self) | {"passed": self.passed}
+
+    @classmethod
+    def from_row(cls, row: Row) -> Verdict:
+        """Inverse of `as_row`."""
+        return cls(row["what"], row["value"], row["target"], row["at_least"])
 
 
 @dataclass(frozen=True)
@@ -115,3 +124,44 @@ def teleport_verdicts(place: Place, streaming: Row, auto: Row) -> Iterator[Verdi
 def growth_verdict(first: str, last: str, times: list[float]) -> Verdict:
     """Of the wheel from a tree to a larger one at the same view."""
     return Verdict(f"growth of wheel from {first} to {last}", times[-1] / times[0], GROWTH)
+
+
+def build_verdicts(name: str, built: Row) -> Iterator[Verdict]:
+    """Of a report of ``nebula build-tree``; the seconds are meant for two free cores."""
+    directional = built["sh_degree"] > 1
+    per_million = built["build_s"] / (built["leaves"] / 1e6)
+    yield Verdict(f"{name}: building, s per M leaves", per_million, 0.8 if directional else 0.5)
+    yield Verdict(f"{name}: peak of the build, GiB", built["peak_rss_bytes"] / 2**30, 6.0)
+
+
+def memory_verdicts(name: str, rows: list[Row]) -> Iterator[Verdict]:
+    """Of `benchmarks.search_memory`."""
+    for row in rows:
+        limit = row["limit_bytes"] / 2**30
+        yield Verdict(f"{name}: peak of {row['method']}, GiB", row["peak_bytes"] / 2**30, limit)
+
+
+def rate_verdicts(what: str, leaves: int, rows: dict[str, Row]) -> Iterator[Verdict]:
+    """Of the compact codec in `benchmarks.stream rate`, at full size."""
+    target = next(mbps for start, mbps in RATES_MBPS.items() if what.startswith(start))
+    for name, row in rows.items():
+        if name != "paper" and leaves >= FULL_SIZE:
+            yield Verdict(f"{what}: {name}, Mbps", row["mbps"], target)
+
+
+def loss_verdicts(scene: str, rows: dict[str, Row]) -> Iterator[Verdict]:
+    """Of the compact codec in `benchmarks.stream loss`."""
+    for name, row in rows.items():
+        if name != "paper":
+            found = row["decoded_vs_cut_db"]
+            yield Verdict(f"{scene}: {name} against the cut, dB", found, DECODED_DB, True)
+
+
+def picture_verdicts(name: str, results: dict[str, Row]) -> Iterator[Verdict]:
+    """Of the compact codec in `benchmarks.first_picture`, by the line alone."""
+    for occasion in ("connect", "teleport"):
+        for picture in results["compact"][occasion]["pictures"]:
+            goal = PICTURES_MS.get(picture["tau_px"])
+            if goal is not None and picture["line_s"] is not None:
+                what = f"{name}: {occasion}, {picture['tau_px']:g} px complete, ms"
+                yield Verdict(what, 1e3 * picture["line_s"], goal)

@@ -31,7 +31,7 @@ def peak_bytes() -> int:
 
 def search(tree: Path, method: str, searches: int, every: int) -> dict[str, float]:
     """Walk through the tree in this process; ``peak_bytes`` and what says that it was a walk."""
-    from benchmarks.lod import Subject  # compiles and imports what is measured
+    from benchmarks.searches import Subject  # compiles and imports what is measured
     from gaussians import parallel
     from lod_cloud import load_tree
     from lod_cloud.search import make_search
@@ -50,7 +50,7 @@ def measure(tree: Path, method: str, searches: int, every: int) -> dict[str, flo
     """`search` in a process of its own."""
     command = [sys.executable, "-m", "benchmarks.search_memory", "--tree", str(tree)]
     command += ["--searches", str(searches), "--every", str(every), "--inside", method]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
     found: dict[str, float] = json.loads(done.stdout)
     return found
 

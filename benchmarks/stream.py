@@ -23,8 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.lod import Subject
 from benchmarks.machine import describe, in_words
+from benchmarks.searches import Subject
 from gaussians import parallel
 from gaussians.cameras import Display, Pose, StereoRig, look_at
 from gaussians.formats import load_scene
@@ -164,24 +164,36 @@ class Pictures:
         x, y, z = (float(v) for v in rig.pose.position)
         return SearchRequest((x, y, z), rig.display.fx * 2064 / rig.display.width, self.tau_px)
 
-    def score(self, scenes: Sequence[Scene], against: Sequence[Any]) -> str:
-        values = [
+    def psnr_db(self, scenes: Sequence[Scene], against: Sequence[Any]) -> list[float]:
+        """Of every view."""
+        return [
             psnr_db(render_mono(scene, rig)[0], image) or float("inf")
             for scene, rig, image in zip(scenes, self.rigs, against, strict=True)
         ]
-        return f"{np.mean(values):6.2f} ({' '.join(f'{v:.1f}' for v in values)})"
+
+    def score(self, scenes: Sequence[Scene], against: Sequence[Any]) -> str:
+        """In words."""
+        return _in_words(self.psnr_db(scenes, against))
 
 
-def loss(pictures: Pictures, codecs: dict[str, Codec], *, fields: bool) -> None:
-    """Prints PSNR in dB; with ``fields`` of every field alone, too."""
+def _in_words(values: Sequence[float]) -> str:
+    return f"{np.mean(values):6.2f} ({' '.join(f'{v:.1f}' for v in values)})"
+
+
+def loss(
+    pictures: Pictures, codecs: dict[str, Codec], *, fields: bool
+) -> dict[str, dict[str, float]]:
+    """Prints PSNR in dB; with ``fields`` of every field alone, too. Returns means by codec."""
     tree = pictures.tree
+    rows: dict[str, dict[str, float]] = {}
     cuts = [flat_search(tree, pictures.request(rig)).node_ids for rig in pictures.rigs]
     originals = [tree.gaussians.take(cut) for cut in cuts]
     images = [
         render_mono(scene, rig)[0] for scene, rig in zip(originals, pictures.rigs, strict=True)
     ]
     print(f"cuts of {', '.join(str(len(cut)) for cut in cuts)} nodes of {len(tree)}")
-    print(f"cut against all leaves          {pictures.score(originals, pictures.full)}")
+    whole = pictures.psnr_db(originals, pictures.full)
+    print(f"cut against all leaves          {_in_words(whole)}")
     for name, codec in codecs.items():
         encoder = TreeEncoder(tree, codec)
         decoded, escapes = [], 0
@@ -190,8 +202,15 @@ def loss(pictures: Pictures, codecs: dict[str, Codec], *, fields: bool) -> None:
             escapes += coded.escapes
             decoded.append(codec.decode(coded.payload).gaussians)
         print(f"{name}: escapes {escapes / sum(len(cut) for cut in cuts):.2%}")
-        print(f"  decoded against the cut       {pictures.score(decoded, images)}")
-        print(f"  decoded against all leaves    {pictures.score(decoded, pictures.full)}")
+        cut_db = pictures.psnr_db(decoded, images)
+        leaves_db = pictures.psnr_db(decoded, pictures.full)
+        print(f"  decoded against the cut       {_in_words(cut_db)}")
+        print(f"  decoded against all leaves    {_in_words(leaves_db)}")
+        rows[name] = {
+            "decoded_vs_cut_db": float(np.mean(cut_db)),
+            "decoded_vs_leaves_db": float(np.mean(leaves_db)),
+            "lost_vs_leaves_db": float(np.mean(whole) - np.mean(leaves_db)),
+        }
         sorted_first = name != "paper"
         for label, some in FIELDS.items() if fields else ():
             mixed = [
@@ -207,6 +226,7 @@ def loss(pictures: Pictures, codecs: dict[str, Codec], *, fields: bool) -> None:
             f" all leaves {pictures.score(walked, pictures.full)}",
             flush=True,
         )
+    return rows
 
 
 FIELDS = {
@@ -326,29 +346,31 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parallel.set_threads(1)
     print(in_words(describe()))
     bits = options.position_bits, options.colour_bits
-    names = options.codec or ["paper", "compact-256x2", "compact-256x4", "compact-4096x2"]
+    names = options.codec or ["paper", "compact-256x2", "compact-4096x2", "compact-512x4"]
     if options.what == "loss":
         tree, poses = _poses(options)
         display = Display.from_fov(options.size, options.size, 90.0)
         rigs = [StereoRig(display, pose, 0.0, options.near) for pose in poses]
         pictures = Pictures.of(tree, rigs, options.tau)
         codecs = {name: _codec(name, tree, bits) for name in names}
-        loss(pictures, codecs, fields=options.fields)
+        rows = loss(pictures, codecs, fields=options.fields)
+        if options.json:
+            options.json.write_text(json.dumps(rows, indent=1))
         return
     tree = load_tree(options.tree)
     subject = Subject.of(str(options.tree), tree)
     requests = subject.requests(
         options.trace, options.every, options.tau, options.searches + 1 + DROPPED
     )
-    rows = {}
+    rates: dict[str, Any] = {}
     for name in names:
         codec = _codec(name, tree, bits)
-        rows[name] = rate(
+        rates[name] = rate(
             subject, tree, codec, requests, options.every, options.hysteresis, options.window
         )
-        print_rate(name, rows[name])
+        print_rate(name, rates[name])
     if options.json:
-        options.json.write_text(json.dumps(rows, indent=1))
+        options.json.write_text(json.dumps(rates, indent=1))
 
 
 if __name__ == "__main__":

@@ -81,7 +81,7 @@ def bits(mask: Mask) -> int:
 
 def lowest_bit(number: int) -> int:
     """Place of the lowest bit that is set, 0 for the number 1; of a number > 0."""
-    return (number & -number).bit_length() - 1
+    return (int(number) & -int(number)).bit_length() - 1
 
 
 def highest_bit(number: int) -> int:

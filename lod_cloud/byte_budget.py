@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Protocol, TypeVar
 
 from gaussians.errors import InputError
 from lod_cloud.criterion import SearchRequest
+from lod_cloud.message_writer import Draft
 from lod_cloud.pacing import Limit, Portion
 from lod_cloud.search_stats import SearchStats
 
@@ -17,22 +17,6 @@ _MARGIN = 0.97  # aimed at, so that the next message of the same kind fits
 _ATTEMPTS = 3  # to fill a message that fits
 _SCALE_LIMIT = 64.0
 _LEAST_PER_ID = 0.25  # bytes; neighbouring ids nearly vanish in the entropy coder
-
-
-class Draft(Protocol):
-    """A message, and what it is about."""
-
-    @property
-    def message(self) -> bytes: ...
-    @property
-    def portion(self) -> Portion: ...
-    @property
-    def payloads(self) -> int: ...
-    @property
-    def payload_bytes(self) -> int: ...
-
-
-AnyDraft = TypeVar("AnyDraft", bound=Draft)
 
 
 class ByteBudget:
@@ -69,12 +53,12 @@ class ByteBudget:
         return nodes * self.per_node < 2 * self.size
 
     def fit(
-        self, choose: Callable[[Limit], Portion], write: Callable[[Portion], AnyDraft], least: int
-    ) -> AnyDraft:
+        self, choose: Callable[[Limit], Portion], write: Callable[[Portion], Draft], least: int
+    ) -> Draft:
         """The fullest draft found that has no more than `size` bytes, else the one of no more than
         ``least`` events (what ``choose`` gives for a limit of 0 bytes).
         """
-        best: AnyDraft | None = None
+        best: Draft | None = None
         if least == 0:  # what the message says in any case
             best = write(choose(self._limit(0.0)))
             if len(best.message) >= self.size:

@@ -16,24 +16,19 @@ may be more.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
-
-import numpy as np
 
 from gaussians.errors import InputError
 from lod_cloud.byte_budget import ByteBudget
-from lod_cloud.codec import NOTHING_CODED, Codec, Encoded
+from lod_cloud.codec import Codec
 from lod_cloud.criterion import SearchRequest
-from lod_cloud.delta_cut import DeltaCut, Probe, Report
-from lod_cloud.events import Events
-from lod_cloud.journal import Entry, Journal
-from lod_cloud.lod_tree import Int32, LodTree
-from lod_cloud.management_table import ManagementTable, TableChange
+from lod_cloud.delta_cut import Report
+from lod_cloud.journal import Journal
+from lod_cloud.lod_tree import LodTree
+from lod_cloud.management_table import ManagementTable
+from lod_cloud.message_writer import Draft, MessageWriter
 from lod_cloud.pacing import ClientCut, Limit, Portion
 from lod_cloud.protocol import (
-    DELTA_CUT,
-    PROBE,
     REPORT,
     SESSION_START,
     LocalProtocolError,
@@ -42,51 +37,13 @@ from lod_cloud.protocol import (
     unseal,
 )
 from lod_cloud.search import Search, SearchResult, SearchTree, make_search
-from lod_cloud.search.events import nodes_that_entered
-from lod_cloud.search_stats import MessageKind, SearchStats
+from lod_cloud.search_stats import SearchStats
 from lod_cloud.session import SessionStart
 from lod_cloud.tree_encoder import TreeEncoder
 
 HYSTERESIS = 0.02  # measured on head traces: 66 % fewer changes for 0.2 % more nodes
 UNACKNOWLEDGED_MESSAGES = 256  # 11 s of searches every four frames
 UNACKNOWLEDGED_NODES = 1 << 19  # 2 MiB; more would be nearly as good as a whole cut
-
-
-@dataclass(frozen=True)
-class _Sets:
-    """What a message names, and from which state on."""
-
-    base: int
-    change: TableChange
-    sent: Int32
-    reactivated: Int32
-    removed: Int32
-    dropped: Int32
-    entry: Entry  # what to remember of it
-    events: Events | None = None  # says the same as the lists
-
-
-@dataclass(frozen=True)
-class _Draft:
-    """A message that may be sent, and the state it leads to; of a probe, the state it leaves."""
-
-    kind: MessageKind
-    message: bytes
-    portion: Portion
-    table: ManagementTable | None = None
-    sets: _Sets | None = None
-    added: int = 0
-    coded: Encoded = NOTHING_CODED
-
-    @property
-    def payloads(self) -> int:
-        """Nodes sent."""
-        return self.coded.sent
-
-    @property
-    def payload_bytes(self) -> int:
-        """Of the nodes sent, before zstd."""
-        return len(self.coded.payload)
 
 
 class Cloud:
@@ -235,27 +192,42 @@ class Cloud:
         self._lost = report.missing or reconnected or old
         self._start_over = self._start_over or report.start_over or not right
 
-    def _draft(self, found: SearchResult, request: SearchRequest) -> _Draft:
+    def _draft(self, found: SearchResult, request: SearchRequest) -> Draft:
         """The next message, by what is known of the client."""
         names = self._journal.unacknowledged() if self._lost else None
+        writer = self._writer()
         if self.sequence == 0 or self._start_over or (self._lost and names is None):
             self._client.clear()
             self._level = False
-            return self._fitted(self._start, found, request, least=0)
+            return self._fitted(writer.start, found, request, least=0)
         if names is not None:
-            return self._fitted(partial(self._repair, names=names), found, request, least=0)
+            return self._fitted(partial(writer.repair, names=names), found, request, least=0)
         if self._journal.full:
-            return self._probe(request)
-        return self._fitted(self._step, found, request, least=1)
+            nothing = Limit(0.0, 1.0, 1.0)
+            wanted = self._search.refined
+            return writer.probe(self._client.first_to(wanted, request, nothing, least=0))
+        return self._fitted(writer.step, found, request, least=1)
+
+    def _writer(self) -> MessageWriter:
+        return MessageWriter(
+            session=self.session,
+            sequence=self.sequence,
+            search_index=self._search_index,
+            frame=self._frame,
+            tree=self._search.tree,
+            table=self.table,
+            journal=self._journal,
+            encoder=self._encoder,
+        )
 
     def _fitted(
         self,
-        write: Callable[[Portion], _Draft],
+        write: Callable[[Portion], Draft],
         found: SearchResult,
         request: SearchRequest,
         *,
         least: int,
-    ) -> _Draft:
+    ) -> Draft:
         """The message about all that is pending, or about what the budget allows."""
         budget, wanted = self._budget, self._search.refined
         events = len(found.expanded) + len(found.collapsed)
@@ -271,83 +243,7 @@ class Cloud:
 
         return budget.fit(choose, write, least)
 
-    def _probe(self, request: SearchRequest) -> _Draft:
-        nothing = Limit(0.0, 1.0, 1.0)
-        portion = self._client.first_to(self._search.refined, request, nothing, least=0)
-        body = Probe(self.session, self.sequence).to_bytes()
-        return _Draft("probe", seal(PROBE, body), portion)
-
-    def _step(self, portion: Portion) -> _Draft:
-        added, removed = self._changed(portion)
-        change = self.table.prepare_step(self._search_index, added, removed)
-        back = added[self.table.holds(added)]
-        entry = self._entry(change, np.concatenate([added, removed]), change.needed)
-        events = Events.of(self.tree, portion.expanded, portion.collapsed)
-        sets = _Sets(self.sequence, change, change.needed, back, removed, _NOTHING, entry, events)
-        return self._written("step", self.table, sets, portion, len(added))
-
-    def _repair(self, portion: Portion, names: tuple[Int32, Int32]) -> _Draft:
-        """Sets every node that a message underway may have touched, whatever arrived of them.
-
-        A node that some message underway brought, or that is held no longer, is sent if it is in
-        the cut and dropped if it is not; the client surely holds all others.
-        """
-        added, removed = self._changed(portion)
-        named = np.unique(np.concatenate([names[0], added, removed]))
-        doubtful = np.isin(named, names[1]) | ~self.table.holds(named)
-        drawn = self.table.in_cut(named) & ~np.isin(named, removed) | np.isin(named, added)
-        left, dropped = named[~drawn & ~doubtful], named[~drawn & doubtful]
-        change = self.table.prepare(self._search_index, named[drawn], left, dropped)
-        sent, back = named[drawn & doubtful], named[drawn & ~doubtful]
-        entry = self._entry(change, named, named[doubtful])
-        sets = _Sets(self._journal.applied, change, sent, back, left, dropped, entry)
-        return self._written("repair", self.table, sets, portion, len(added))
-
-    def _start(self, portion: Portion) -> _Draft:
-        cut = self._changed(portion)[0] if len(portion.expanded) else _ROOT
-        table = self.table.emptied()
-        change = table.prepare_step(self._search_index, cut, _NOTHING)
-        entry = Entry.start(self.sequence + 1, change.state_hash)
-        sets = _Sets(0, change, cut, _NOTHING, _NOTHING, _NOTHING, entry)
-        return self._written("start", table, sets, portion, len(cut))
-
-    def _changed(self, portion: Portion) -> tuple[Int32, Int32]:
-        """Nodes that enter and leave the client's cut."""
-        tree, expanded, collapsed = self._search.tree, portion.expanded, portion.collapsed
-        return (
-            nodes_that_entered(tree, expanded, collapsed),
-            nodes_that_entered(tree, collapsed, expanded),
-        )
-
-    def _entry(self, change: TableChange, named: Int32, brought: Int32) -> Entry:
-        limit = self._journal.node_limit
-        return Entry.change(self.sequence + 1, change.state_hash, named, brought, limit)
-
-    def _written(
-        self, kind: MessageKind, table: ManagementTable, sets: _Sets, portion: Portion, added: int
-    ) -> _Draft:
-        if sets.events is None:
-            coded = self._encoder.encode(sets.sent)
-        else:
-            coded = self._encoder.encode_step(sets.events, sets.sent, table)
-        delta = DeltaCut(
-            session=self.session,
-            sequence=self.sequence + 1,
-            base=sets.base,
-            search_index=self._search_index,
-            frame=self._frame,
-            reactivated=_NOTHING if sets.events else sets.reactivated,
-            removed=_NOTHING if sets.events else sets.removed,
-            events=coded.events,
-            dropped=sets.dropped,
-            payload=coded.payload,
-            state_hash=sets.change.state_hash,
-            codec_hash=self._encoder.codec.version,
-        )
-        message = seal(DELTA_CUT, delta.to_bytes(self._encoder.child_numbers))
-        return _Draft(kind, message, portion, table, sets, added, coded)
-
-    def _commit(self, draft: _Draft) -> None:
+    def _commit(self, draft: Draft) -> None:
         """The message is sent."""
         self._level = draft.portion.last and draft.sets is not None
         if draft.sets is None or draft.table is None:
@@ -363,7 +259,7 @@ class Cloud:
             self._repaired = self.sequence
             self._lost = self._start_over = False
 
-    def _counted(self, found: SearchResult, request: SearchRequest, draft: _Draft) -> SearchStats:
+    def _counted(self, found: SearchResult, request: SearchRequest, draft: Draft) -> SearchStats:
         sets, portion = draft.sets, draft.portion
         per_node = self._budget.per_node if self._budget else 0.0
         return SearchStats(
@@ -389,7 +285,3 @@ class Cloud:
             nodes_tested=found.nodes_tested,
             bytes_touched=found.bytes_touched,
         )
-
-
-_NOTHING = np.empty(0, np.int32)
-_ROOT = np.zeros(1, np.int32)

@@ -153,6 +153,10 @@ class ColumnReader:
         """All that is left."""
         return self.raw(len(self._data) - self._position)
 
+    def ahead(self) -> memoryview:
+        """All that is left, without reading it."""
+        return memoryview(self._data)[self._position :]
+
     def varint(self) -> int:
         value = shift = 0
         while True:

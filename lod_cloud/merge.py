@@ -21,7 +21,6 @@ worth). Each half keeps a single node, as in HierGS, with a ``pair_within`` of 1
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -34,7 +33,10 @@ from gaussians.scene import Scene
 from lod_cloud.lod_tree import Float32, Int32
 from lod_cloud.moments import (
     LANES,
+    NEST_MARGIN,
     ROWS,
+    around,
+    box,
     covariance,
     find_axes,
     rounded_up,
@@ -68,9 +70,9 @@ from lod_cloud.pairing import (
 )
 from lod_cloud.split import STACK, halved
 
-NEST_MARGIN = 1.0 + 2.0**-19  # exceeds the rounding of the float32 node test
 _PIECE = 4096  # leaves, at most, that are merged on their own first
 _TAKEN_PIECES = 16  # at a time
+_RELEASED = 16  # such times between two releases
 _NO_COLOURS = np.empty((0, 3), np.float32)
 
 
@@ -130,7 +132,9 @@ def merge_leaves(
     first = (count + bounds - keep * np.arange(pieces + 1)).astype(np.int32)
 
     def merge(begin: int, end: int) -> None:
-        for low in range(begin, end, _TAKEN_PIECES):
+        for turn, low in enumerate(range(begin, end, _TAKEN_PIECES)):
+            if turn % _RELEASED == 0:
+                release()
             high = min(low + _TAKEN_PIECES, end)
             colours = _take(scene, ids, bounds[low], bounds[high], nodes)
             rule = bounds[low : high + 1], first[low:], pair_within, keep, margin
@@ -142,9 +146,9 @@ def merge_leaves(
                 nodes,
                 children,
             )
-        release()
 
     run_chunks(merge, pieces)
+    release()
     first = np.array([2 * count - kept.numbers[:, 0].sum()], np.int32)
     whole = np.array([0, count], np.int32)
     _merge((whole, first, size, 1, margin), _NO_COLOURS, kept, root, nodes, children)
@@ -220,7 +224,7 @@ def _merge(rule, colours, below, out, nodes, children):  # type: ignore[no-untyp
                     for axis in range(3):
                         colour = colours[node - bounds[0], axis]
                         moments[np.uint64(axis) * ROW + RED + np.uint64(slot)] = colour
-                    size, side = _box(slot, moments)
+                    size, side = box(*_diagonal(slot, moments))
                     radius[node], extent[node] = rounded_up(size), rounded_up(side)
             for slot in range(half):  # leaves with all, else the one half with the other
                 judge(slot, half if joins else slot + 1, count, moments, costs)
@@ -262,11 +266,10 @@ def _enter(node, slot, means, quaternions, scales, opacities, moments):  # type:
 
 
 @njit
-def _box(slot, moments):  # type: ignore[no-untyped-def]
-    """Half diagonal and longest side of the 3-sigma box."""
+def _diagonal(slot, moments):  # type: ignore[no-untyped-def]
+    """Of the covariance."""
     i = np.uint64(slot)
-    xx, yy, zz = moments[i + XX], moments[i + YY], moments[i + ZZ]
-    return 3.0 * math.sqrt(xx + yy + zz), 6.0 * math.sqrt(max(xx, yy, zz))
+    return moments[i + XX], moments[i + YY], moments[i + ZZ]
 
 
 @njit
@@ -274,16 +277,11 @@ def _wrap(node, left, right, slot, moments, means, radius, extent, margin):  # t
     """Mean, R and e of a node: around its own box and its children's spheres."""
     for axis in range(3):
         means[node, axis] = np.float32(moments[(6 + axis) * MOST_SLOTS + slot])
-    half, side = _box(slot, moments)
+    half, side = box(*_diagonal(slot, moments))
     for child in (left, right):
-        gap = 0.0
-        for axis in range(3):
-            d = np.float64(means[child, axis]) - np.float64(means[node, axis])
-            gap += d * d
-        half = max(half, (np.float64(radius[child]) + math.sqrt(gap)) * margin)
-        side = max(side, np.float64(extent[child]) * margin)
-    radius[node] = rounded_up(half)
-    extent[node] = rounded_up(side)
+        reach, length = around(radius[child], extent[child], means, child, means, node, margin)
+        half, side = max(half, reach), max(side, length)
+    radius[node], extent[node] = rounded_up(half), rounded_up(side)
 
 
 @njit

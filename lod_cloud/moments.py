@@ -1,4 +1,8 @@
-"""Second moments of Gaussians for merging: covariance, its axes, surface. Kernels, float64.
+"""Second moments of Gaussians for merging: covariance, its axes, surface, and the spheres of the
+node test around them. Kernels, float64.
+
+A node's R and e hold its own 3-sigma box (half diagonal, longest side) and exceed those of its
+children by ``NEST_MARGIN``: R_ch + |m_ch - m|, e_ch. Rounded up once, to float32.
 
 Axes are found for up to `LANES` covariances at a time, element by element in one array, which
 compilers turn into vector instructions; the bits are those of one at a time.
@@ -9,6 +13,7 @@ import math
 import numpy as np
 from numba import njit
 
+NEST_MARGIN = 1.0 + 2.0**-19  # exceeds the rounding of the float32 node test
 LANES = 64
 ROWS = 10  # of LANES numbers: xx, xy, xz, yy, yz, zz; quaternion w, x, y, z
 # unsigned: with signed indices, which might count from the end, nothing is vectorised
@@ -26,6 +31,29 @@ def rounded_up(value):  # type: ignore[no-untyped-def]
     if np.float64(nearest) < value:
         return np.int32(nearest.view(np.int32) + np.int32(1)).view(np.float32)
     return nearest
+
+
+@njit
+def box(xx, yy, zz):  # type: ignore[no-untyped-def]
+    """Half diagonal and longest side of the 3-sigma box of a covariance with this diagonal."""
+    return 3.0 * math.sqrt(xx + yy + zz), 6.0 * math.sqrt(max(xx, yy, zz))
+
+
+@njit
+def own_box(quaternions, scales, node):  # type: ignore[no-untyped-def]
+    """`box` of a node's covariance."""
+    xx, _, _, yy, _, zz = covariance(quaternions, scales, node)
+    return box(xx, yy, zz)
+
+
+@njit
+def around(radius, extent, means, child, above, node, margin):  # type: ignore[no-untyped-def]
+    """Least R and e of a node, at ``above[node]``, that hold a child's, at ``means[child]``."""
+    gap = 0.0
+    for axis in range(3):
+        d = np.float64(means[child, axis]) - np.float64(above[node, axis])
+        gap += d * d
+    return (np.float64(radius) + math.sqrt(gap)) * margin, np.float64(extent) * margin
 
 
 @njit

@@ -1,13 +1,12 @@
-"""Merges the children of a node once more: what a client does when they give way to their parent.
+"""Merges any number of Gaussians at once, and the children of a node once more: what a client does
+when they give way to their parent.
 
-The formula is that of `lod_cloud.merge` and `lod_cloud.harmonics`, for any number of children at
-once and from float32 values; a node's value differs from the builder's by rounding. R and e are
-what the builder takes: around the node's own box and its children's spheres.
+The formula is that of `lod_cloud.merge` and `lod_cloud.harmonics`, from float32 values; a node's
+value differs from the builder's by rounding. R and e are what the builder takes: around the node's
+own box and its children's spheres.
 """
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 from numba import njit
@@ -15,9 +14,20 @@ from numpy.typing import NDArray
 
 from gaussians.parallel import run_chunks
 from gaussians.scene import FIELDS, Scene
-from lod_cloud.lod_tree import Int32, LodTree
-from lod_cloud.merge import NEST_MARGIN
-from lod_cloud.moments import LANES, ROWS, covariance, find_axes, rounded_up, store_axes, surface
+from lod_cloud.lod_tree import Float32, Int32, LodTree
+from lod_cloud.moments import (
+    LANES,
+    NEST_MARGIN,
+    ROWS,
+    around,
+    box,
+    covariance,
+    find_axes,
+    own_box,
+    rounded_up,
+    store_axes,
+    surface,
+)
 from lod_cloud.node_records import NodeRecords
 
 MEAN_ERROR = 2.0**-11  # of a faithful merge per axis, in largest standard deviations
@@ -29,21 +39,27 @@ def merge_siblings(ids: Int32, parents: Int32, children: NodeRecords, bounds: In
     """The nodes ``ids`` [G] with these parents: node g is the merge of the records
     ``children[bounds[g]:bounds[g + 1]]``, at least one. Does not depend on threads.
     """
-    groups = len(ids)
-    source = children.gaussians
-    shapes = [(groups, *getattr(source, name).shape[1:]) for name in FIELDS]
-    scene = Scene(*(np.empty(shape, np.float32) for shape in shapes))
-    spheres = np.empty((2, groups), np.float32)
-    run_chunks(
-        _merge,
-        groups,
-        bounds,
-        tuple(np.ascontiguousarray(getattr(source, name)) for name in FIELDS),
-        (children.radius, children.extent),
-        tuple(getattr(scene, name) for name in FIELDS),
-        spheres,
-    )
-    return NodeRecords(ids, parents, np.diff(bounds), spheres[0], spheres[1], scene)
+    ranges = np.stack([bounds[:-1], bounds[1:]], axis=1)
+    below = np.stack([children.radius, children.extent])
+    spheres = np.empty((2, len(ids)), np.float32)
+    merged = _merged(children.gaussians, ranges, below, spheres)
+    return NodeRecords(ids, parents, np.diff(bounds), spheres[0], spheres[1], merged)
+
+
+def merge_ranges(scene: Scene, ranges: Int32) -> Scene:
+    """[G] merges of the Gaussians ``ranges[g, 0]`` .. ``ranges[g, 1]`` of a scene, at least one in
+    each [G, 2]; ranges may overlap. Does not depend on threads.
+    """
+    nothing = np.empty((2, 0), np.float32)
+    return _merged(scene, ranges, nothing, nothing)
+
+
+def _merged(source: Scene, ranges: Int32, below: Float32, spheres: Float32) -> Scene:
+    """Merges; with ``spheres`` [2, G] R and e too, from those of the source."""
+    arrays = tuple(np.ascontiguousarray(getattr(source, name)) for name in FIELDS)
+    merged = tuple(np.empty((len(ranges), *array.shape[1:]), np.float32) for array in arrays)
+    run_chunks(_merge, len(ranges), ranges, arrays, below, merged, spheres)
+    return Scene(*merged)
 
 
 def faithful(tree: LodTree, nodes: Int32) -> NDArray[np.bool_]:
@@ -88,48 +104,62 @@ def _masses(scene: Scene) -> NDArray[np.float64]:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _merge(begin, end, bounds, children, spheres, merged, out):  # type: ignore[no-untyped-def]
+def _merge(begin, end, ranges, source, below, merged, spheres):  # type: ignore[no-untyped-def]
     """Groups begin..end, so many at a time as `find_axes` takes."""
-    means, quaternions, scales, opacities, sh = children
     lanes, masses = np.zeros(ROWS * LANES), np.empty((2, LANES))
+    colours = np.empty(source[4].shape[1:])
     for base in range(begin, end, LANES):
         count = min(LANES, end - base)
         for lane in range(count):
             group = base + lane
-            low, high = bounds[group], bounds[group + 1]
-            total = 0.0
-            for child in range(low, high):
-                total += np.float64(opacities[child]) * surface(scales, child)
-            x = y = z = opacity = 0.0
-            for child in range(low, high):
-                share = _share(child, total, high - low, opacities, scales)
-                x += share * means[child, 0]
-                y += share * means[child, 1]
-                z += share * means[child, 2]
-                opacity += share * opacities[child]
-            for k in range(6):
-                lanes[k * LANES + lane] = 0.0
-            for child in range(low, high):
-                share = _share(child, total, high - low, opacities, scales)
-                xx, xy, xz, yy, yz, zz = covariance(quaternions, scales, child)
-                dx, dy, dz = means[child, 0] - x, means[child, 1] - y, means[child, 2] - z
-                lanes[lane] += share * (xx + dx * dx)
-                lanes[LANES + lane] += share * (xy + dx * dy)
-                lanes[2 * LANES + lane] += share * (xz + dx * dz)
-                lanes[3 * LANES + lane] += share * (yy + dy * dy)
-                lanes[4 * LANES + lane] += share * (yz + dy * dz)
-                lanes[5 * LANES + lane] += share * (zz + dz * dz)
-            _colour(group, low, high, total, opacities, scales, sh, merged[4])
-            merged[0][group, 0], merged[0][group, 1] = np.float32(x), np.float32(y)
-            merged[0][group, 2] = np.float32(z)
-            masses[0, lane], masses[1, lane] = total, opacity
-            _wrap(group, low, high, lanes, lane, children, spheres, merged[0], out)
+            low, high = ranges[group, 0], ranges[group, 1]
+            _sum_up(group, low, high, source, merged, colours, lane, lanes, masses)
+            if spheres.shape[1]:
+                _wrap(group, low, high, lanes, lane, source, below, merged[0], spheres)
         find_axes(lanes, count)
         for lane in range(count):
             area = store_axes(lanes, lane, base + lane, merged[1], merged[2])
             whole = masses[0, lane] > 0.0 and area > 0.0
             opacity = masses[0, lane] / area if whole else masses[1, lane]
             merged[3][base + lane] = np.float32(opacity)
+
+
+@njit
+def _sum_up(group, low, high, source, merged, colours, lane, lanes, masses):  # type: ignore[no-untyped-def]
+    """Mean and harmonics of a group; its covariance and masses stay in its lane."""
+    means, quaternions, scales, opacities, sh = source
+    total = 0.0
+    for child in range(low, high):
+        total += np.float64(opacities[child]) * surface(scales, child)
+    x = y = z = opacity = 0.0
+    colours[:] = 0.0
+    for child in range(low, high):
+        share = _share(child, total, high - low, opacities, scales)
+        x += share * means[child, 0]
+        y += share * means[child, 1]
+        z += share * means[child, 2]
+        opacity += share * opacities[child]
+        for k in range(sh.shape[1]):
+            for channel in range(3):
+                colours[k, channel] += share * sh[child, k, channel]
+    for k in range(6):
+        lanes[k * LANES + lane] = 0.0
+    for child in range(low, high):
+        share = _share(child, total, high - low, opacities, scales)
+        xx, xy, xz, yy, yz, zz = covariance(quaternions, scales, child)
+        dx, dy, dz = means[child, 0] - x, means[child, 1] - y, means[child, 2] - z
+        lanes[lane] += share * (xx + dx * dx)
+        lanes[LANES + lane] += share * (xy + dx * dy)
+        lanes[2 * LANES + lane] += share * (xz + dx * dz)
+        lanes[3 * LANES + lane] += share * (yy + dy * dy)
+        lanes[4 * LANES + lane] += share * (yz + dy * dz)
+        lanes[5 * LANES + lane] += share * (zz + dz * dz)
+    masses[0, lane], masses[1, lane] = total, opacity
+    merged[0][group, 0], merged[0][group, 1] = np.float32(x), np.float32(y)
+    merged[0][group, 2] = np.float32(z)
+    for k in range(sh.shape[1]):
+        for channel in range(3):
+            merged[4][group, k, channel] = np.float32(colours[k, channel])
 
 
 @njit
@@ -140,36 +170,12 @@ def _share(child, total, count, opacities, scales):  # type: ignore[no-untyped-d
 
 
 @njit
-def _colour(group, low, high, total, opacities, scales, sh, out):  # type: ignore[no-untyped-def]
-    for k in range(sh.shape[1]):
-        for channel in range(3):
-            value = 0.0
-            for child in range(low, high):
-                share = _share(child, total, high - low, opacities, scales)
-                value += share * sh[child, k, channel]
-            out[group, k, channel] = np.float32(value)
-
-
-@njit
-def _box(xx, yy, zz):  # type: ignore[no-untyped-def]
-    """Half diagonal and longest side of the 3-sigma box."""
-    return 3.0 * math.sqrt(xx + yy + zz), 6.0 * math.sqrt(max(xx, yy, zz))
-
-
-@njit
-def _wrap(group, low, high, lanes, lane, children, spheres, means, out):  # type: ignore[no-untyped-def]
+def _wrap(group, low, high, lanes, lane, source, below, means, spheres):  # type: ignore[no-untyped-def]
     """R and e. A leaf's are those of its own box; a client does not know them."""
-    half, side = _box(lanes[lane], lanes[3 * LANES + lane], lanes[5 * LANES + lane])
+    half, side = box(lanes[lane], lanes[3 * LANES + lane], lanes[5 * LANES + lane])
     for child in range(low, high):
-        xx, _, _, yy, _, zz = covariance(children[1], children[2], child)
-        own_half, own_side = _box(xx, yy, zz)
-        gap = 0.0
-        for axis in range(3):
-            d = np.float64(children[0][child, axis]) - np.float64(means[group, axis])
-            gap += d * d
-        radius = max(np.float64(spheres[0][child]), own_half)
-        extent = max(np.float64(spheres[1][child]), own_side)
-        half = max(half, (radius + math.sqrt(gap)) * NEST_MARGIN)
-        side = max(side, extent * NEST_MARGIN)
-    out[0, group] = rounded_up(half)
-    out[1, group] = rounded_up(side)
+        radius, extent = own_box(source[1], source[2], child)
+        radius, extent = max(radius, below[0, child]), max(extent, below[1, child])
+        reach, length = around(radius, extent, source[0], child, means, group, NEST_MARGIN)
+        half, side = max(half, reach), max(side, length)
+    spheres[0, group], spheres[1, group] = rounded_up(half), rounded_up(side)

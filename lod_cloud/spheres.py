@@ -1,53 +1,99 @@
-"""Node spheres of an irregular tree, around the children a node has after others were left out."""
+"""Node spheres (R, e) of nodes whose Gaussians are there: trained, placed copies, or merged with
+other children than they have now. The rule is that of `lod_cloud.moments`.
+"""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 from numba import njit
 
 from gaussians.parallel import run_chunks
-from lod_cloud.merge import NEST_MARGIN, Nodes
-from lod_cloud.moments import covariance, rounded_up
+from gaussians.scene import Scene
+from lod_cloud.lod_tree import Float32, Int32
+from lod_cloud.merge import Nodes
+from lod_cloud.moments import NEST_MARGIN, around, own_box, rounded_up
 from lod_cloud.numbering import Numbering
 
 
-def tighten_spheres(numbering: Numbering, nodes: Nodes, margin: float = NEST_MARGIN) -> None:
-    """Give the numbered interior nodes the R and e of `lod_cloud.build` over their own children.
+def own_spheres(scene: Scene) -> tuple[Float32, Float32]:
+    """R and e [N] of every Gaussian's own 3-sigma box: half diagonal, longest side."""
+    radius, extent = np.empty(len(scene), np.float32), np.empty(len(scene), np.float32)
+    _own(scene.quaternions, scene.scales, radius, extent)
+    return radius, extent
+
+
+def enclose(
+    parents: Int32,
+    below: tuple[Float32, Float32, Float32],
+    above: tuple[Float32, Float32, Float32],
+) -> None:
+    """Raise R and e of the nodes ``above`` (means, R, e) until they hold those ``below``.
+
+    ``parents`` [children] is the row in ``above`` of every child.
+    """
+    _enclose(parents, below, above)
+
+
+def enclose_levels(
+    parent: Int32, level_offsets: Int32, means: Float32, radius: Float32, extent: Float32
+) -> None:
+    """`enclose` for all levels of a breadth-first tree, from the bottom; R and e in place."""
+    for level in range(len(level_offsets) - 2, 0, -1):
+        above, begin, end = (int(v) for v in level_offsets[level - 1 : level + 2])
+        lower, upper = slice(begin, end), slice(above, begin)
+        enclose(
+            parent[lower] - np.int32(above),
+            (means[lower], radius[lower], extent[lower]),
+            (means[upper], radius[upper], extent[upper]),
+        )
+
+
+def tighten_spheres(numbering: Numbering, nodes: Nodes) -> None:
+    """Give the numbered interior nodes R and e over the children they have after others were left
+    out.
 
     The binary tree's spheres hold these children too, but more loosely: a path over nodes that
     were left out is no shorter than the direct one, and each of its steps has a margin.
     """
     offsets = numbering.level_offsets
+    links = numbering.first_child, numbering.child_count, numbering.nodes
     for level in range(len(offsets) - 2, -1, -1):
         begin, end = int(offsets[level]), int(offsets[level + 1])
-        run_chunks(
-            _tighten,
-            end - begin,
-            begin,
-            numbering.first_child,
-            numbering.child_count,
-            numbering.nodes,
-            nodes,
-            margin,
-        )
+        run_chunks(_tighten, end - begin, begin, *links, nodes)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _tighten(begin, end, offset, first_child, child_count, numbers, nodes, margin):  # type: ignore[no-untyped-def]
+def _own(quaternions, scales, radius, extent):  # type: ignore[no-untyped-def]
+    for node in range(len(radius)):
+        half, side = own_box(quaternions, scales, node)
+        radius[node], extent[node] = rounded_up(half), rounded_up(side)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _enclose(parents, below, above):  # type: ignore[no-untyped-def]
+    means, radius, extent = below
+    above_means, above_radius, above_extent = above
+    for child in range(len(parents)):
+        node = parents[child]
+        reach, side = around(
+            radius[child], extent[child], means, child, above_means, node, NEST_MARGIN
+        )
+        above_radius[node] = max(above_radius[node], rounded_up(reach))
+        above_extent[node] = max(above_extent[node], rounded_up(side))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _tighten(begin, end, offset, first_child, child_count, numbers, nodes):  # type: ignore[no-untyped-def]
+    means, quaternions, scales, _, radius, extent = nodes
     for row in range(offset + begin, offset + end):
         if child_count[row] == 0:
             continue
         node = numbers[row]
-        xx, _, _, yy, _, zz = covariance(nodes.quaternions, nodes.scales, node)
-        half, side = 3.0 * math.sqrt(xx + yy + zz), 6.0 * math.sqrt(max(xx, yy, zz))
+        half, side = own_box(quaternions, scales, node)
         for k in range(first_child[row], first_child[row] + child_count[row]):
             child = numbers[k]
-            gap = 0.0
-            for axis in range(3):
-                d = np.float64(nodes.means[child, axis]) - np.float64(nodes.means[node, axis])
-                gap += d * d
-            half = max(half, (np.float64(nodes.radius[child]) + math.sqrt(gap)) * margin)
-            side = max(side, np.float64(nodes.extent[child]) * margin)
-        nodes.radius[node], nodes.extent[node] = rounded_up(half), rounded_up(side)
+            reach, length = around(
+                radius[child], extent[child], means, child, means, node, NEST_MARGIN
+            )
+            half, side = max(half, reach), max(side, length)
+        radius[node], extent[node] = rounded_up(half), rounded_up(side)

@@ -7,9 +7,8 @@ from numpy.typing import NDArray
 
 from gaussians.errors import InputError
 from lod_cloud.criterion import SearchRequest
-from lod_cloud.cut import difference
 from lod_cloud.lod_tree import LodTree
-from lod_cloud.search import flat_search
+from lod_cloud.search import SearchTree, make_search
 
 _CORRIDOR_M = 7.5  # to both sides of the path: a street
 _NOT_SMALLER = 0.95  # of the parent's extent
@@ -58,10 +57,10 @@ def _added_per_m(
 ) -> float:
     step = (path[-1] - path[0]) / np.linalg.norm(path[-1] - path[0]) * _STEP_M
     start = path[len(path) // 2]
-    added, before = 0, None
+    search = make_search("flat", SearchTree.of(tree))
+    added = 0
     for number in range(searches + 1):
         x, y, z = (float(c) for c in start + number * step)
-        cut = flat_search(tree, SearchRequest((x, y, z), focal_px, tau_px)).node_ids
-        added += 0 if before is None else len(difference(cut, before))
-        before = cut
+        found = search.search(SearchRequest((x, y, z), focal_px, tau_px))
+        added += 0 if found.first else len(found.added)
     return added / (searches * _STEP_M)

@@ -1,14 +1,13 @@
-"""The commands of the command line and their options.
+"""The commands of the command line and their options; those about trees: `nebula.cli_trees`.
 
 Commands import what they need when they run, so that ``nebula --help`` is quick. Each one hands an
 options object of ``nebula.options`` to ``run`` of the module of its own name, which returns a
-``CommandResult``; printing and ``--json`` are handled here, once, and errors in `nebula.program`.
+``CommandResult``; printing and ``--json`` are handled in `nebula.execution`, errors in
+`nebula.program`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -17,32 +16,27 @@ import click
 from gaussians.errors import InputError
 from nebula.cli_options import (
     COUNT,
-    EXACT_METHODS,
     METHODS,
     NOT_NEGATIVE,
     POSITIVE,
-    SEARCH_METHODS,
-    SHARE,
-    Finite,
     accelerator_option,
     baseline_option,
     display_options,
-    hysteresis_option,
     json_option,
     method_option,
     out_option,
     paced_option,
     scene_options,
     seed_option,
-    tau_option,
     threads_option,
     trace_option,
     trace_options,
     view_option,
     view_options,
 )
+from nebula.cli_trees import build_tree, search, stream
+from nebula.execution import SCENE_KEYS, VIEW_KEYS, execute
 from nebula.figures import FIGURES
-from nebula.output import STDOUT, CommandResult, check_json_target, write_json
 
 HELP = """NEBULA: stereo Gaussian splatting in the cloud and on an accelerator.
 
@@ -60,6 +54,10 @@ EPILOG = (
 @click.version_option(package_name="nebula-splat", message="nebula %(version)s")
 def cli() -> None:
     """The group of all commands."""
+
+
+for command in (build_tree, search, stream):
+    cli.add_command(command)
 
 
 @cli.command()
@@ -82,7 +80,7 @@ def simulate(json_target: str | None, **values: Any) -> None:
     """Replay a head trace through everything and write a report."""
     from nebula.options import SimulateOptions
 
-    _execute("simulate", SimulateOptions, values, json_target)
+    execute("simulate", SimulateOptions, values, json_target)
 
 
 @cli.command()
@@ -98,7 +96,7 @@ def render(json_target: str | None, **values: Any) -> None:
     """Render one stereo frame as PNG files."""
     from nebula.options import RenderOptions
 
-    _execute("render", RenderOptions, values, json_target)
+    execute("render", RenderOptions, values, json_target)
 
 
 @cli.command()
@@ -147,7 +145,7 @@ def verify(context: click.Context, json_target: str | None, **values: Any) -> No
     values["moving"] = values["trace"] is not None or (values["frames"] or 1) > 1
     values["frames"] = values["frames"] or (12 if values["moving"] else 1)
     values["tile_px"] = int(values["tile_px"])
-    _execute("verify", VerifyOptions, values, json_target)
+    execute("verify", VerifyOptions, values, json_target)
 
 
 @cli.command()
@@ -163,7 +161,7 @@ def info(file: str | None, json_target: str | None, **values: Any) -> None:
     if file is not None and values["scene"] is not None:
         raise InputError("FILE and --scene name the same thing; give one of them")
     values["scene"] = values["scene"] or file
-    _execute("info", InfoOptions, values, json_target)
+    execute("info", InfoOptions, values, json_target)
 
 
 @cli.command()
@@ -190,123 +188,11 @@ def convert(source: str, up: str | None, json_target: str | None, **values: Any)
     """
     from nebula.options import ConvertOptions, parse_up_change
 
-    idle = [f"--{key.removesuffix('_deg')}" for key in _VIEW_KEYS if values[key] is not None]
+    idle = [f"--{key.removesuffix('_deg')}" for key in VIEW_KEYS if values[key] is not None]
     if values["decimate_tau_px"] is None and idle:
         raise InputError(f"{', '.join(idle)}: of use for --decimate-tau only, which is not given")
     old, values["new_up"] = (None, None) if up is None else parse_up_change(up)
-    _execute("convert", ConvertOptions, values | {"scene": source, "up": old}, json_target)
-
-
-@cli.command("build-tree")
-@scene_options
-@click.option(
-    "--tiled",
-    metavar="NAME|FILE",
-    help="Large city from configs/trees/: city, dense_city. --city-leaves changes its size.",
-)
-@click.option("--sh-degree", type=click.IntRange(0, 3), help="Of a tiled city.  [default: 3]")
-@click.option(
-    "--pair-within",
-    type=click.IntRange(1, 64),
-    default=16,
-    show_default=True,
-    help="The cheapest pair of so many neighbours merges first; 1: the halves of a split.",
-)
-@click.option(
-    "--fan-out-ratio",
-    type=Finite(min=0, max=1, min_open=True),
-    default=1.0,
-    show_default=True,
-    help="Leave out nodes above this share of their parent's size, such as 0.7.",
-)
-@click.option(
-    "--structure",
-    type=click.Choice(["merged", "blocks", "instances", "octree"]),
-    default="merged",
-    show_default=True,
-    help="Pairs merged; levels of a lod-meta.json; a subtree per copy of a layout; voxels.",
-)
-@seed_option
-@threads_option
-@out_option(None)
-@json_option
-def build_tree(
-    tiled: str | None, sh_degree: int | None, json_target: str | None, **values: Any
-) -> None:
-    """Build the level-of-detail tree of a scene."""
-    from nebula.options import BuildTreeOptions, tiled_tree
-
-    if tiled is None and sh_degree is not None:
-        raise InputError("--sh-degree: of use for --tiled only, which is not given")
-    if tiled is not None:
-        leaves = values.pop("city_leaves")
-        idle = [key for key in (*_SCENE_KEYS, "config") if values.get(key) is not None]
-        idle += ["structure"] if values["structure"] != "merged" else []
-        if idle:
-            names = ", ".join(f"--{key.replace('_', '-')}" for key in idle)
-            raise InputError(f"--tiled brings its own scene; {names}: not of use")
-        values |= {"tiled": tiled_tree(tiled, leaves, sh_degree), "city_leaves": None}
-    _execute("build_tree", BuildTreeOptions, values, json_target)
-
-
-@cli.command()
-@click.option("--tree", required=True, type=click.Path(path_type=Path), metavar="DIR")
-@seed_option
-@view_options
-@trace_option
-@click.option("--frames", type=COUNT, help="Of the trace.  [default: enough for 460 searches]")
-@click.option("--every", "search_every", type=COUNT, default=4, show_default=True, help="Frames.")
-@tau_option
-@click.option("--method", type=SEARCH_METHODS, default="auto", show_default=True, metavar="NAME")
-@click.option("--compare", is_flag=True, help="All methods and baseline rules, one after another.")
-@hysteresis_option(0.0)
-@threads_option
-@json_option
-def search(json_target: str | None, **values: Any) -> None:
-    """Search a stored tree along a head trace; time methods and compare their cuts."""
-    from nebula.options import SearchOptions
-
-    _execute("search", SearchOptions, values, json_target)
-
-
-@cli.command()
-@click.option("--tree", type=click.Path(path_type=Path), metavar="DIR", help="Instead of a scene.")
-@scene_options
-@seed_option
-@view_options
-@trace_option
-@click.option("--frames", type=COUNT, help="Of the trace.  [default: enough for 450 searches]")
-@click.option("--every", "search_every", type=COUNT, default=4, show_default=True, help="Frames.")
-@tau_option
-@click.option("--method", type=EXACT_METHODS, default="auto", show_default=True, metavar="NAME")
-@hysteresis_option(0.02)
-@click.option(
-    "--codec",
-    type=click.Choice(["paper", "compact"]),
-    default="compact",
-    show_default=True,
-    help="Coding of the nodes.",
-)
-@click.option("--rate-mbps", type=POSITIVE, default=100.0, show_default=True, help="Link rate.")
-@click.option("--latency-ms", type=NOT_NEGATIVE, default=5.0, show_default=True, help="One way.")
-@paced_option
-@click.option("--loss", type=SHARE, default=0.0, help="Share of the messages lost, either way.")
-@click.option("--reorder", type=SHARE, default=0.0, help="Share that arrive one search later.")
-@click.option("--corruption", type=SHARE, default=0.0, help="Share with a bit flipped.")
-@threads_option
-@json_option
-def stream(tree: Path | None, json_target: str | None, **values: Any) -> None:
-    """Play a head trace through cloud, link and client, without rendering.
-
-    The scene's tree is built first, unless --tree names a stored one.
-    """
-    from nebula.options import StreamOptions
-
-    idle = [key for key in _TREE_KEYS if tree is not None and values.get(key) is not None]
-    if idle:
-        names = ", ".join(f"--{key.replace('_', '-')}" for key in idle)
-        raise InputError(f"--tree brings its own scene; {names}: not of use")
-    _execute("stream", StreamOptions, values | {"tree": tree}, json_target)
+    execute("convert", ConvertOptions, values | {"scene": source, "up": old}, json_target)
 
 
 @cli.command()
@@ -325,7 +211,7 @@ def area(json_target: str | None, **values: Any) -> None:
     from nebula.options import AreaOptions
 
     values["node_nm"] = float(values["node_nm"])
-    _execute("area", AreaOptions, values, json_target)
+    execute("area", AreaOptions, values, json_target)
 
 
 @cli.command()
@@ -337,7 +223,7 @@ def energy(json_target: str | None, **values: Any) -> None:
     """Print what every action costs, and the energy of a finished run."""
     from nebula.options import EnergyOptions
 
-    _execute("energy", EnergyOptions, values, json_target)
+    execute("energy", EnergyOptions, values, json_target)
 
 
 @cli.command(
@@ -368,41 +254,11 @@ def figure(
     """
     from nebula.options import FigureOptions
 
-    given = {key: values.pop(key) for key in _SCENE_KEYS if key in values}
+    given = {key: values.pop(key) for key in SCENE_KEYS if key in values}
     values |= {"name": name, "config": config, "given": given, "threads": threads}
-    _execute("figure", FigureOptions, values, json_target)
-
-
-_VIEW_KEYS = ("view", "fov_deg", "width", "height", "display")
-_TREE_KEYS = ("scene", "city_leaves", "level", "up", "units_per_metre", "config")
-_SCENE_KEYS = (
-    *("scene", "city_leaves", "level", "up", "units_per_metre", "near_m", "trace"),
-    *_VIEW_KEYS,
-)
+    execute("figure", FigureOptions, values, json_target)
 
 
 def _is_given(context: click.Context, parameter: click.Parameter) -> bool:
     source = context.get_parameter_source(parameter.name or "")
     return source not in (None, click.core.ParameterSource.DEFAULT)
-
-
-def _execute(
-    name: str, options: Callable[..., Any], values: dict[str, Any], json_target: str | None
-) -> None:
-    """Run ``nebula.<name>.run`` on its options object; print and write what it returns."""
-    check_json_target(json_target)
-    threads = values.pop("threads", None)
-    if "view" in values or "level" in values:
-        from nebula.options import scene_options
-
-        given = {key: values.pop(key) for key in _SCENE_KEYS if key in values}
-        values["scene"] = scene_options(values.pop("config", None), given)
-    if threads is not None:
-        from gaussians.parallel import set_threads
-
-        set_threads(threads)
-    result: CommandResult = import_module(f"nebula.{name}").run(options(**values))
-    if json_target != STDOUT:
-        click.echo(result.text)
-    if json_target is not None:
-        write_json(json_target, result.data)

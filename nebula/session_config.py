@@ -55,7 +55,7 @@ class LodSearch(Provenance):
 
 @dataclass(frozen=True, kw_only=True)
 class CodebookSize(Provenance):
-    """Vector quantisation of the spherical harmonics."""
+    """Vector quantisation of the spherical harmonics, by one codec."""
 
     words: int
     stages: int
@@ -73,7 +73,8 @@ class SessionConfig:
     display_rate: DisplayRate
     cloud: CloudTime
     search: LodSearch
-    codebook: CodebookSize
+    codebook: CodebookSize  # of the paper's codec
+    compact_codebook: CodebookSize
 
 
 def load_session_config() -> SessionConfig:

@@ -78,10 +78,11 @@ def run(options: StreamOptions) -> CommandResult:
 
 
 def make_codec(name: str, tree: LodTree, seed: int, config: SessionConfig) -> Codec:
-    """The codec of that name, with the codebook size of configs/session."""
-    book = config.codebook
+    """The codec of that name, with its codebook size of configs/session."""
     if name == "paper":
+        book = config.codebook
         return PaperCodec.train(tree, seed, words=book.words, stages=book.stages)
+    book = config.compact_codebook
     return CompactCodec.train(tree, seed, words=book.words, stages=book.stages)
 
 

@@ -19,7 +19,7 @@ from gaussians.render import render_stereo
 from gaussians.stereo_method import PRESETS
 from gaussians.synthetic import generate_city
 from gaussians.tiling import TileGrid, row_spans, tile_lists
-from lod_cloud import SearchRequest, build_tree, prove_nesting
+from lod_cloud import Client, Cloud, CompactCodec, SearchRequest, build_tree, prove_nesting
 from lod_cloud.search import SEARCHES, OctreeGsSearch, SearchTree, make_search
 from nebula import simulate
 from nebula.options import SimulateOptions, scene_options
@@ -39,22 +39,29 @@ FLOAT64 = {
     "gaussians.tiling._row_entries": "same",
     "gaussians.tiling._column_span": "same",
     "gaussians.synthetic": "scenes are generated in float64 and rounded once",
+    "lod_cloud.codec.positions._complete": "steps are powers of two; means are rounded once",
     "lod_cloud.criterion._count_violations": "places the proof's cameras, then rounds them",
     "lod_cloud.harmonics": "parents are merged in float64 and rounded once",
     "lod_cloud.merge": "same; sizes are rounded up",
     "lod_cloud.moments": "same",
+    "lod_cloud.pacing_kernels._error": "what is sent first; decides about no node",
+    "lod_cloud.pacing_kernels.expand_first": "passes the camera on to it; budgets are float64",
     "lod_cloud.pairing": "costs of merging, and the moments that merge",
     "lod_cloud.siblings": "clients merge as the builder does",
     "lod_cloud.spheres": "sizes in float64, rounded up",
     "lod_cloud.search.sectors": "bounds on the camera's way; no decision is taken with them",
     "lod_cloud.search.treelets._margin": "how long a decision holds, by a stated bound",
-    "lod_cloud.search.treelets.search_treelets": "keeps those margins; decisions are float32",
+    "lod_cloud.search.treelets._is_valid": "compares with those margins",
+    "lod_cloud.search.treelets._test_below": "keeps those margins; decisions are float32",
+    "lod_cloud.search.treelets.search_treelets": "same",
     "lod_cloud.search.wheel_buckets": "when an entry is due, by a stated bound",
 }
 # Of these, where float32 matters beside float64: the float64 variables by name.
 NAMES = {
     "gaussians.projection._project": {"det", "wide_xx", "wide_xy", "wide_yy"},
-    "lod_cloud.search.treelets.search_treelets": {"balls", "dx", "dy", "dz", "holds", "least"},
+    "lod_cloud.pacing_kernels.expand_first": {"cx", "cy", "cz", "limit_nodes"},
+    "lod_cloud.search.treelets._test_below": {"least"},
+    "lod_cloud.search.treelets.search_treelets": {"balls", "holds", "least"},
     "lod_cloud.criterion._count_violations": {
         *("ax", "ay", "az", "sx", "sy", "sz", "length", "away", "cameras"),
     },
@@ -89,6 +96,7 @@ def kernels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     prove_nesting(build_tree(generate_city(1500, 0).scene))
     _render_otherwise()
     _search_otherwise()
+    _stream_otherwise()
     return project_kernels()
 
 
@@ -114,6 +122,19 @@ def _search_otherwise() -> None:
     OctreeGsSearch(tree).select(SearchRequest((0, 0, 2), 900.0, 6.0))
 
 
+def _stream_otherwise() -> None:
+    """A byte budget, and the codec `simulate` does not use, there and back."""
+    tree = build_tree(generate_city(1500, 0).scene)
+    cloud = Cloud(tree, CompactCodec.train(tree, 0), budget_bytes=500)
+    client = Client()
+    client.receive(cloud.session_start())
+    for step in range(40):
+        x = 0.1 * step + 200.0 * (step // 10 % 2)
+        client.receive(cloud.search(SearchRequest((x, 0, 2), 900.0, 3.0), 4 * step))
+        cloud.receive(client.report())
+    assert cloud.stats is not None and cloud.stats.message_bytes <= 500
+
+
 @pytest.fixture(scope="module")
 def found(kernels: dict[str, Any]) -> dict[str, dict[str, str]]:
     """float64 variables of every kernel that declares none, or declares them by name.
@@ -126,7 +147,7 @@ def found(kernels: dict[str, Any]) -> dict[str, dict[str, str]]:
     variables: dict[str, dict[str, str]] = {}
     while ready := [n for n, k in open_ones.items() if n not in variables and k.signatures]:
         variables |= {name: float64_variables(open_ones[name]) for name in ready}
-    assert set(open_ones) - set(variables) == set(), "kernels that the run above does not call"
+    assert sorted(set(open_ones) - set(variables)) == [], "kernels that the run above does not call"
     return variables
 
 

@@ -5,15 +5,18 @@ Field, coding, largest error:
 * mean: a whole number of steps per axis, of which only the lowest bits travel; half a step. The
   step is the power of two at most 2^-`position.bits` times the node's coded largest standard
   deviation
-* scales: the largest of the three in an 8-bit logarithm over the tree's range, the others as 8-bit
+* scales: the largest of the three as a logarithm over the tree's range, the others as 8-bit
   logarithms of their ratio to it, 2^-12 to 1 (what is smaller is coded as 0); `LogField.max_ratio`
 * rotation: smallest three, 3 x 8 bit and a 2-bit index, of the axes ordered by scale; 0.02 rad
-* opacity: 8-bit logarithm over the tree's range, 0 exactly
+* opacity: logarithm over the tree's range, 0 exactly
 * SH degree 0: `colour_bits` each, linear over the tree's range
 * SH above: words of a residual codebook; 1 per coefficient
 * R, e of interior nodes: 4-bit logarithm, rounded up, of their ratio to what follows from the
   decoded scales
 * id, parent, number of children: exact
+
+All but the lowest bits of positions (and of long words) goes through an entropy coder with the
+frequencies of the tree, `lod_cloud.codec.node_columns`.
 
 The decoded value of a node does not depend on what the client was sent before, although positions
 are coded relative to what it holds (`lod_cloud.codec.positions`) and it may have merged that itself
@@ -32,28 +35,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gaussians.codebook import Codebook
-from gaussians.compression import (
-    LinearField,
-    LogField,
-    UInt16,
-    decode_rotation,
-    encode_rotation,
-)
+from gaussians.compression import UInt16
 from gaussians.errors import InputError
-from gaussians.scene import Scene
-from lod_cloud.codec.axes import sorted_axes
 from lod_cloud.codec.interface import Encoded, References
-from lod_cloud.codec.positions import PositionSteps
-from lod_cloud.codec.shapes import BYTE, ShapeFields, surface
-from lod_cloud.codec.tolerance import CODED_MASS_ERROR, merge_tolerance
+from lod_cloud.codec.node_columns import Column, Layout, Rows
+from lod_cloud.codec.node_fields import NodeFields
+from lod_cloud.codec.node_tables import Tables, count_tables, layout_of
+from lod_cloud.codec.rans import Frequencies, Puller, Pusher
+from lod_cloud.codec.tolerance import merge_tolerance
 from lod_cloud.codec.training import (
     Sample,
     check_words,
+    drawn_nodes,
     harmonics,
     pack,
     train_codebook,
     version_of,
-    within,
+    words_of,
 )
 from lod_cloud.columns import ColumnReader, ColumnWriter
 from lod_cloud.lod_tree import Float32, Int32, LodTree
@@ -65,31 +63,29 @@ from lod_cloud.node_records import (
     with_rows,
 )
 
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 RULE = "opacity x surface"  # by which a tree says that its interior nodes are merges
-_OPACITY_LOW = np.float32(2.0**-12)
-_COLOUR_MARGIN = 0.125  # of the sampled range at either end: fewer escapes for 2 dB of 61
-_MOST_COLOUR_BITS = 16
+_COARSEST_NODES = 1 << 14  # which every client gets first: none of them should be an escape
 
 
 @dataclass(frozen=True)
 class CompactCodec:
-    """Parameters and codebook of one session. Both ends hold an equal one; `version` proves it."""
+    """Parameters, codebook and frequencies of one session. Both ends hold an equal one; `version`
+    proves it. Raises InputError for frequencies that do not fit the other two.
+    """
 
     sh_degree: int
     merge_levels: int  # of a tree whose interior nodes are merges; 0 of any other
-    position: PositionSteps
-    shape: ShapeFields
-    opacity: LogField
-    dc: LinearField
+    fields: NodeFields
     codebook: Codebook | None  # None exactly for SH degree 0
+    tables: Tables  # by the keys of `lod_cloud.codec.node_columns`
 
     def __post_init__(self) -> None:
-        if not 1 <= self.dc.top < 1 << _MOST_COLOUR_BITS:
-            raise InputError(f"colour bits must be 1 to {_MOST_COLOUR_BITS}")
+        for key, shape in self.layout.shapes().items():
+            if key not in self.tables or self.tables[key].table.shape != shape:
+                contexts, symbols = shape
+                raise InputError(f"frequencies of {key} must be {contexts} x {symbols}")
 
     @classmethod
     def train(
@@ -97,31 +93,29 @@ class CompactCodec:
         tree: LodTree,
         seed: int,
         *,
-        words: int = 256,
-        stages: int = 2,
+        words: int = 512,
+        stages: int = 4,
         position_bits: int = 6,
         colour_bits: int = 7,
     ) -> CompactCodec:
-        """Ranges and codebook from nodes of ``tree``, drawn with ``seed`` where it is large.
+        """Ranges, codebook and frequencies from nodes of ``tree``, drawn with ``seed`` where it is
+        large.
 
         Clients merge collapsed nodes where the tree's metadata say that its interior nodes are
         merges.
         """
-        sample = Sample.of(tree, seed)
-        merges = tree.metadata.build.get("merge") == RULE
-        dc = within(sample.dc)
-        low, high = float(dc.min()), float(dc.max())
-        margin = _COLOUR_MARGIN * (high - low) if high > low else 1.0
-        opacities = np.maximum(within(sample.opacities), _OPACITY_LOW)
-        return cls(
-            sh_degree=tree.sh_degree,
-            merge_levels=tree.levels if merges else 0,
-            position=PositionSteps(position_bits),
-            shape=ShapeFields.train(sample.scales, sample.inner, sample.radius, sample.extent),
-            opacity=LogField.covering(opacities, top=BYTE),
-            dc=LinearField(low - margin, high + margin, (1 << colour_bits) - 1),
-            codebook=train_codebook(tree, seed, words, stages),
-        )
+        sample = Sample.of(tree, seed, coarsest=_COARSEST_NODES)
+        fields = NodeFields.train(sample, position_bits, colour_bits)
+        codebook = train_codebook(tree, seed, words, stages)
+        levels = tree.levels if tree.metadata.build.get("merge") == RULE else 0
+        tolerance = merge_tolerance(fields.position.max_error, levels)
+        tables = count_tables(tree, drawn_nodes(tree, seed), fields, codebook, tolerance)
+        return cls(tree.sh_degree, levels, fields, codebook, tables)
+
+    @cached_property
+    def layout(self) -> Layout:
+        """The columns of a payload."""
+        return layout_of(self.fields, self.codebook)
 
     @property
     def merges(self) -> bool:
@@ -135,7 +129,7 @@ class CompactCodec:
 
     @cached_property
     def version(self) -> int:
-        """64-bit hash of all parameters and the codebook."""
+        """64-bit hash of all parameters, frequencies and the codebook."""
         return version_of(self.to_bytes())
 
     @property
@@ -148,39 +142,30 @@ class CompactCodec:
         """Largest error per axis of the mean of a node that a client holds, in the node's largest
         standard deviation.
         """
-        return merge_tolerance(self.position.max_error, self.merge_levels)
+        return merge_tolerance(self.fields.position.max_error, self.merge_levels)
 
     def to_bytes(self) -> bytes:
-        """Parameters and codebook, for `lod_cloud.codec.read_codec`."""
+        """Parameters, frequencies and codebook, for `lod_cloud.codec.read_codec`."""
         parameters = {
             "codec": "compact",
             "sh_degree": self.sh_degree,
             "merge_levels": self.merge_levels,
-            "position_bits": self.position.bits,
-            "shape": self.shape.ranges,
-            "opacity": [self.opacity.low, self.opacity.high],
-            "dc": [self.dc.low, self.dc.high, self.dc.top],
+            **self.fields.parameters,
+            "frequencies": {key: found.table.tolist() for key, found in self.tables.items()},
         }
         return pack(parameters, self.codebook)
 
     @classmethod
     def from_parameters(cls, p: dict[str, Any], codebook: Codebook | None) -> CompactCodec:
         """Inverse of `to_bytes`, for `lod_cloud.codec.read_codec`, which words the errors."""
-        return cls(
-            sh_degree=p["sh_degree"],
-            merge_levels=int(p["merge_levels"]),
-            position=PositionSteps(int(p["position_bits"])),
-            shape=ShapeFields.of(p["shape"]),
-            opacity=LogField(p["opacity"][0], p["opacity"][1], top=BYTE),
-            dc=LinearField(*p["dc"]),
-            codebook=codebook,
-        )
+        fields = NodeFields.of(p)
+        keys = layout_of(fields, codebook).shapes()
+        tables = {key: Frequencies.of(p["frequencies"][key]) for key in keys}
+        return cls(p["sh_degree"], int(p["merge_levels"]), fields, codebook, tables)
 
     def assign_words(self, tree: LodTree, ids: Int32) -> tuple[UInt16, Mask]:
         """Codebook words [N, stages] of nodes, and whether they are near enough; costly."""
-        if self.codebook is None:
-            return np.empty((len(ids), 0), np.uint16), np.ones(len(ids), np.bool_)
-        return self.codebook.encode(harmonics(tree.gaussians, ids))
+        return words_of(tree, ids, self.codebook)
 
     # ------------------------------------------------------------ encoding
 
@@ -194,9 +179,11 @@ class CompactCodec:
         references: References | None = None,
     ) -> Encoded:
         """See `Codec.encode`."""
-        codes, exact = self._codes(nodes)
-        kept = np.flatnonzero(~exact)
-        inner = nodes.child_counts > 0
+        codes, exact = self.fields.encode(nodes)
+        kept, inner = ~exact, nodes.child_counts > 0
+        where = codes.places[kept], codes.sigmas[kept, 0]
+        held = references.take(np.flatnonzero(kept)) if references else None
+        choices = self.fields.position.choose(*where, held, self.tolerance)
         writer = ColumnWriter()
         nodes.write_places(writer, places=places)
         writer.begin("child counts")
@@ -207,49 +194,31 @@ class CompactCodec:
         writer.plain(nodes.float32_rows(np.flatnonzero(exact), coefficients=1))
         writer.positions(np.flatnonzero(~near))
         writer.plain(harmonics(nodes.gaussians, np.flatnonzero(~near)))
-        writer.begin("position")
-        self.position.write(
-            writer,
-            codes.places[kept],
-            codes.sigmas[kept, 0],
-            references.take(kept) if references else None,
-            self.tolerance,
+        rows = [Rows.of(inner[some], nodes.parents[some]) for some in (kept, near)]
+        pusher = Pusher()
+
+        def push(
+            key: str, _: tuple[int, int], contexts: Column, values: Column | None, /
+        ) -> Column:
+            assert values is not None
+            pusher.add(key.split(".")[0], self.tables[key], values, contexts)
+            return values
+
+        self.layout.pass_through(
+            push,
+            rows,
+            codes.columns(kept, inner, self.layout.colours)
+            | self.layout.high_parts(words[near])
+            | {"position": choices},
         )
-        for name, column in (("scale", codes.shape), ("rotation", codes.rotation)):
-            writer.begin(name)
-            writer.plain(column[kept].astype(np.uint8))
-        writer.bits(codes.omitted[kept], 2)
-        writer.begin("opacity")
-        writer.plain(codes.opacity[kept].astype(np.uint8))
-        writer.begin("colour")
-        writer.bits(codes.dc[kept].T, self.dc.top.bit_length())
+        pusher.write(writer)
+        writer.begin("position")
+        self.fields.position.write(writer, where[0], choices)
         writer.begin("harmonics")
-        for book, column in zip(self._books, words[near].T, strict=True):
-            writer.bits(column, _bits(book))
-        writer.begin("spheres")
-        writer.bits(codes.spheres[kept][inner[kept]], 4)
+        for column, (_, low) in zip(words[near].T, self.layout.words, strict=True):
+            writer.bits(column, low)
         escapes = int(np.count_nonzero(exact | ~near))
         return Encoded(writer.bytes(), len(nodes), escapes, writer.sizes)
-
-    def _codes(self, nodes: NodeRecords) -> tuple[_Codes, Mask]:
-        """Codes of every node, and which nodes they do not stand for well enough."""
-        scene = nodes.gaussians
-        scales, quaternions = sorted_axes(scene.scales, scene.quaternions)
-        shape, in_range = self.shape.encode(scales)
-        sigmas = self.shape.decode(shape)
-        places, placed = self.position.encode(scene.means, sigmas[:, 0])
-        opacity, fits = self.opacity.encode(scene.opacities)
-        dc, dc_fits = self.dc.encode(scene.sh[:, 0])
-        spheres, wrapped = self.shape.encode_spheres(sigmas, nodes.radius, nodes.extent)
-        omitted, rotation = encode_rotation(quaternions.astype(np.float32), BYTE)
-        off = np.abs(self.position.decode(places, sigmas[:, 0]).astype(np.float64) - scene.means)
-        mass = scene.opacities * surface(scales)
-        lost = np.abs(self.opacity.decode(opacity) * surface(sigmas) - mass)
-        valid = in_range & placed & fits & dc_fits.all(axis=1)
-        valid &= wrapped | (nodes.child_counts == 0)
-        valid &= (off <= self.position.max_error * scales[:, :1]).all(axis=1)
-        valid &= lost <= CODED_MASS_ERROR * mass
-        return _Codes(places, shape, omitted, rotation, opacity, dc, spheres, sigmas), ~valid
 
     # ------------------------------------------------------------ decoding
 
@@ -272,70 +241,45 @@ class CompactCodec:
         width = 3 * ((self.sh_degree + 1) ** 2 - 1)
         above = np.empty((count, width), np.float32)
         above[far] = reader.plain(np.float32, len(far), width).reshape(len(far), width)
-        coded = np.ones(count, np.bool_)
-        coded[exact] = False
-        near = None if references is None else references[coded]
-        gaussians = self._read_gaussians(reader, int(coded.sum()), near)
-        self._read_harmonics(reader, above, far)
-        spheres = np.zeros((len(gaussians), 2), np.float32)
-        below = inner[coded]
-        sigmas = gaussians.scales[below].astype(np.float64)
-        spheres[below] = self.shape.read_spheres(reader, sigmas)
+        kept, near = (_all_but(some, count) for some in (exact, far))
+        known = [Rows.of(inner[some], parents[some]) for some in (kept, near)]
+        puller = Puller(reader)
+        values = self.layout.pass_through(
+            lambda key, _, contexts, __: puller.column(self.tables[key], contexts),
+            known,
+            None,
+        )
+        puller.finish()
+        sigmas = self.fields.sigmas(values)
+        choices = values["position"].astype(np.int64)
+        held = None if references is None else references[kept]
+        whole = self.fields.position.read(reader, choices, sigmas[:, 0], held)
+        gaussians = self.fields.decode(values, sigmas, whole)
+        self._read_harmonics(reader, values, above, near)
         reader.finish()
+        spheres = np.zeros((len(gaussians), 2), np.float32)
+        spheres[inner[kept]] = self.fields.spheres(values, sigmas[inner[kept]])
         records = with_rows((ids, parents, child_counts), spheres, gaussians, exact, rows)
         sh = np.concatenate([records.gaussians.sh, above.reshape(count, width // 3, 3)], axis=1)
-        whole = dataclasses.replace(records.gaussians, sh=sh)
-        return dataclasses.replace(records, gaussians=whole).check()
+        scene = dataclasses.replace(records.gaussians, sh=sh)
+        return dataclasses.replace(records, gaussians=scene).check()
 
-    def _read_gaussians(
-        self, reader: ColumnReader, count: int, references: Float32 | None
-    ) -> Scene:
-        """Of SH degree 0."""
-        lowest = self.position.read(reader, count)
-        shape = reader.plain(np.uint8, count, 3).astype(np.uint16)
-        rotation = reader.plain(np.uint8, count, 3).astype(np.uint16)
-        omitted = reader.bits(count, 2).astype(np.uint8)
-        opacity = reader.plain(np.uint8, count).astype(np.uint16)
-        dc = reader.bits(3 * count, self.dc.top.bit_length()).reshape(3, count).T
-        sigmas = self.shape.decode(shape)
-        places = self.position.nearest(lowest, sigmas[:, 0], references)
-        return Scene(
-            self.position.decode(places, sigmas[:, 0]),
-            decode_rotation(omitted, rotation, BYTE),
-            sigmas.astype(np.float32),
-            self.opacity.decode(opacity),
-            self.dc.decode(dc.astype(np.uint16))[:, None],
-        )
-
-    def _read_harmonics(self, reader: ColumnReader, above: Float32, far: Int64) -> None:
-        """The rows of ``above`` that are not ``far``."""
+    def _read_harmonics(
+        self, reader: ColumnReader, values: dict[str, Column], above: Float32, near: Mask
+    ) -> None:
+        """The rows of ``above`` that are ``near``."""
         if self.codebook:
-            others = np.ones(len(above), np.bool_)
-            others[far] = False
-            count = int(others.sum())
-            words = np.stack([reader.bits(count, _bits(book)) for book in self._books], axis=1)
+            count = int(near.sum())
+            columns = [
+                values[f"harmonics.{stage}"].astype(np.uint32) << low | reader.bits(count, low)
+                for stage, (_, low) in enumerate(self.layout.words)
+            ]
+            words = np.stack(columns, axis=1)
             check_words(words, self.codebook)
-            above[others] = self.codebook.decode(words.astype(np.uint16))
-
-    @property
-    def _books(self) -> tuple[NDArray[np.float16], ...]:
-        return self.codebook.stages if self.codebook else ()
+            above[near] = self.codebook.decode(words.astype(np.uint16))
 
 
-def _bits(book: NDArray[np.float16]) -> int:
-    """Of a word's number."""
-    return (len(book) - 1).bit_length()
-
-
-@dataclass(frozen=True)
-class _Codes:
-    """What may be sent of some nodes."""
-
-    places: Int64  # [N, 3]
-    shape: UInt16  # [N, 3]
-    omitted: NDArray[np.uint8]  # [N]
-    rotation: UInt16  # [N, 3]
-    opacity: UInt16  # [N]
-    dc: UInt16  # [N, 3]
-    spheres: UInt16  # [N, 2]
-    sigmas: Float64  # [N, 3] as they will be decoded
+def _all_but(rows: NDArray[np.int64], count: int) -> Mask:
+    kept = np.ones(count, np.bool_)
+    kept[rows] = False
+    return kept

@@ -45,10 +45,10 @@ from lod_cloud.codec.interface import Encoded, References
 from lod_cloud.codec.training import (
     Sample,
     check_words,
-    harmonics,
     pack,
     train_codebook,
     version_of,
+    words_of,
 )
 from lod_cloud.columns import ColumnReader, ColumnWriter
 from lod_cloud.lod_tree import Float32, Int32, LodTree
@@ -145,9 +145,7 @@ class PaperCodec:
 
     def assign_words(self, tree: LodTree, ids: Int32) -> tuple[UInt16, NDArray[np.bool_]]:
         """Codebook words [N, stages] of nodes, and whether they are near enough; costly."""
-        if self.codebook is None:
-            return np.empty((len(ids), 0), np.uint16), np.ones(len(ids), np.bool_)
-        return self.codebook.encode(harmonics(tree.gaussians, ids))
+        return words_of(tree, ids, self.codebook)
 
     def encode(
         self,

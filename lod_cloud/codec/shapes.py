@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from gaussians.compression import LogField, UInt16
 from lod_cloud.codec.training import within
-from lod_cloud.columns import ColumnReader
 from lod_cloud.lod_tree import Float32
 
 Float64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 BYTE = 255
-_NIBBLE = 15
+WIDE = 351  # for ranges that take in the coarsest nodes: codes that are rare cost the others little
+SPHERE = 15
 _THINNEST = -12.0  # logarithm of a ratio that is told from 0
 _RATIO = LogField(_THINNEST, 0.0, top=BYTE)
 _SLACK = 1.05  # decoded scales differ from those that ratios were trained on
@@ -37,7 +37,7 @@ class ShapeFields:
         """Ranges from nodes [N], of which ``inner`` have a sphere."""
         sigmas = scales[inner].astype(np.float64)
         return cls(
-            LogField.covering(within(scales.max(axis=1)), top=BYTE),
+            LogField.covering(within(scales.max(axis=1)), top=WIDE),
             _ratios(radius[inner], _half_diagonal(sigmas)),
             _ratios(extent[inner], _longest_side(sigmas)),
         )
@@ -46,8 +46,8 @@ class ShapeFields:
     def of(cls, ranges: list[list[float]]) -> ShapeFields:
         """Inverse of `ranges`."""
         (a, b), radius, extent = ranges
-        wrapped = [LogField(low, high, True, _NIBBLE) for low, high in (radius, extent)]
-        return cls(LogField(a, b, top=BYTE), *wrapped)
+        wrapped = [LogField(low, high, True, SPHERE) for low, high in (radius, extent)]
+        return cls(LogField(a, b, top=WIDE), *wrapped)
 
     @property
     def ranges(self) -> list[list[float]]:
@@ -78,9 +78,8 @@ class ShapeFields:
         other, too = self.extent.encode(extent / np.maximum(_longest_side(sigmas), 1e-300))
         return np.stack([one, other], axis=1), fits & too
 
-    def read_spheres(self, reader: ColumnReader, sigmas: Float64) -> Float32:
+    def decode_spheres(self, codes: UInt16, sigmas: Float64) -> Float32:
         """[N, 2] R and e, never below what was coded."""
-        codes = reader.bits(2 * len(sigmas), 4).reshape(-1, 2).astype(np.uint16)
         radius = self.radius.decode(codes[:, 0]) * _half_diagonal(sigmas)
         extent = self.extent.decode(codes[:, 1]) * _longest_side(sigmas)
         return _rounded_up(np.stack([radius, extent], axis=1))
@@ -96,9 +95,9 @@ def _ratios(values: Float32, bases: Float64) -> LogField:
     some = bases > 0
     ratios = within(values[some] / bases[some])
     if not len(ratios):
-        return LogField(-1.0, 1.0, True, _NIBBLE)
+        return LogField(-1.0, 1.0, True, SPHERE)
     ends = np.array([ratios.min() / _SLACK, ratios.max() * _SLACK])
-    return LogField.covering(ends, round_up=True, top=_NIBBLE)
+    return LogField.covering(ends, round_up=True, top=SPHERE)
 
 
 def _half_diagonal(sigmas: Float64) -> Float64:

@@ -37,10 +37,13 @@ class Sample:
     inner: NDArray[np.bool_]  # [N]
 
     @classmethod
-    def of(cls, tree: LodTree, seed: int) -> Sample:
-        """All nodes, or ``RANGE_NODES`` of more than ``WHOLE_NODES``, drawn with ``seed``."""
+    def of(cls, tree: LodTree, seed: int, *, coarsest: int = 0) -> Sample:
+        """All nodes, or ``RANGE_NODES`` of more than ``WHOLE_NODES``, drawn with ``seed``, and the
+        ``coarsest`` ones.
+        """
         most = len(tree) if len(tree) <= WHOLE_NODES else RANGE_NODES
-        ids = _drawn(len(tree), most, np.random.default_rng([seed, 1]))
+        drawn = _drawn(len(tree), most, np.random.default_rng([seed, 1]))
+        ids = np.union1d(np.arange(min(coarsest, len(tree)), dtype=np.int32), drawn)
         scene = tree.gaussians
         return cls(
             ids,
@@ -57,8 +60,22 @@ def train_codebook(tree: LodTree, seed: int, words: int, stages: int) -> Codeboo
     """From at most ``CODEBOOK_NODES`` nodes drawn with ``seed``; None for SH degree 0."""
     if not tree.sh_degree:
         return None
-    nodes = _drawn(len(tree), CODEBOOK_NODES, np.random.default_rng(seed))
+    nodes = drawn_nodes(tree, seed)
     return Codebook.train(harmonics(tree.gaussians, nodes), words=words, stages=stages, seed=seed)
+
+
+def drawn_nodes(tree: LodTree, seed: int) -> Int32:
+    """At most ``CODEBOOK_NODES`` nodes, drawn with ``seed``; ascending."""
+    return _drawn(len(tree), CODEBOOK_NODES, np.random.default_rng(seed))
+
+
+def words_of(
+    tree: LodTree, ids: Int32, codebook: Codebook | None
+) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
+    """Codebook words [N, stages] of nodes, and whether they are near enough."""
+    if codebook is None:
+        return np.empty((len(ids), 0), np.uint16), np.ones(len(ids), np.bool_)
+    return codebook.encode(harmonics(tree.gaussians, ids))
 
 
 def within(values: NDArray[Any]) -> NDArray[Any]:

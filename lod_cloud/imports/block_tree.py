@@ -34,8 +34,8 @@ from gaussians.formats.lod_meta import LodSet
 from gaussians.scene import Scene, concatenate
 from lod_cloud.build import BuildOptions, build_tree
 from lod_cloud.imports.numbering import tree_from_parents
-from lod_cloud.imports.spheres import enclose, enclose_levels, own_spheres
 from lod_cloud.lod_tree import Float32, Int32, LodTree, Point, TreeMetadata
+from lod_cloud.spheres import enclose, enclose_levels, own_spheres
 
 _NEIGHBOURS = 8
 _DEFAULT = BuildOptions()

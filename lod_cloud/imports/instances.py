@@ -30,8 +30,8 @@ from gaussians.transforms import transformed
 from lod_cloud.array_file import ArrayFile
 from lod_cloud.build import BuildOptions, BuildTimes, build_tree
 from lod_cloud.criterion import prove_nesting
-from lod_cloud.imports.spheres import enclose_levels, own_spheres
 from lod_cloud.lod_tree import ARRAYS, Float32, Int32, LodTree, Point, TreeMetadata
+from lod_cloud.spheres import enclose_levels, own_spheres
 from lod_cloud.tree_files import TreeWriter
 
 Int64 = NDArray[np.int64]

@@ -2,7 +2,7 @@
 
 There, level l has one anchor per occupied voxel of edge E / 2^l, and anchors are trained. Here E is
 the edge of the cube around all means, and a voxel's node is the merge of the Gaussians in it (the
-formulas of `lod_cloud.merge`, for any number of them at once). Levels end where voxels are as
+formulas of `lod_cloud.merge`, as `lod_cloud.siblings` has them). Levels end where voxels are as
 small as the median Gaussian is long; a voxel with a single Gaussian is that Gaussian. So a node's
 depth is its level, and the tree is one like any other: `lod_cloud.search.octree_gs` applies
 the original's rule to it, all other searches theirs.
@@ -13,16 +13,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from gaussians.constants import OPACITY_LIMIT
 from gaussians.errors import InputError
-from gaussians.parallel import run_chunks
-from gaussians.scene import FIELDS, Scene, concatenate
+from gaussians.scene import Scene, concatenate
 from lod_cloud.imports.numbering import tree_from_parents
-from lod_cloud.imports.spheres import enclose_levels, own_spheres
 from lod_cloud.lod_tree import Int32, LodTree, Point, TreeMetadata
-from lod_cloud.moments import LANES, ROWS, covariance, find_axes, store_axes, surface
+from lod_cloud.siblings import merge_ranges
+from lod_cloud.spheres import enclose_levels, own_spheres
 
 LEVEL_LIMIT = 20  # three coordinates of so many bits fit in 64
 STRUCTURE = "octree"  # metadata.build["structure"]
@@ -50,11 +48,12 @@ def build_octree(
     codes = _morton(means, low, edge, levels)
     ids = np.argsort(codes, kind="stable").astype(np.int32)
     bounds, parent = _voxels(codes[ids], levels)
-    merged = _merged(scene, ids, bounds)
+    leaves = scene.take(ids)
+    merged = merge_ranges(leaves, bounds)
     densest = float(merged.opacities.max(initial=0.0))
     if not densest <= OPACITY_LIMIT:
         raise InputError(f"merged opacities must not exceed {OPACITY_LIMIT:g}, not {densest:g}")
-    gaussians = concatenate([merged, scene.take(ids)])
+    gaussians = concatenate([merged, leaves])
     radius, extent = own_spheres(gaussians)
     build = {
         "structure": STRUCTURE,
@@ -118,78 +117,6 @@ def _within(sizes: np.ndarray) -> np.ndarray:
     return np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
 
 
-def _merged(scene: Scene, ids: Int32, bounds: Int32) -> Scene:
-    shapes = ((3,), (4,), (3,), (), scene.sh.shape[1:])
-    out = Scene(*(np.empty((len(bounds), *shape), np.float32) for shape in shapes))
-    arrays = tuple(getattr(scene, field) for field in FIELDS)
-    results = tuple(getattr(out, field) for field in FIELDS)
-    run_chunks(_merge_ranges, len(bounds), bounds, ids, arrays, results)
-    return out
-
-
 def _point(coordinates: np.ndarray) -> Point:
     x, y, z = (float(c) for c in coordinates)
     return x, y, z
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _merge_ranges(begin, end, bounds, ids, scene, out):  # type: ignore[no-untyped-def]
-    """Voxels ``begin`` .. ``end``, `LANES` at a time."""
-    lanes = np.zeros(ROWS * LANES)
-    masses = np.empty((2, LANES))
-    for low in range(begin, end, LANES):
-        high = min(low + LANES, end)
-        for voxel in range(low, high):
-            members = ids[bounds[voxel, 0] : bounds[voxel, 1]]
-            _sum_up(voxel, voxel - low, members, scene, out, lanes, masses)
-        find_axes(lanes, high - low)
-        for voxel in range(low, high):
-            lane = voxel - low
-            area = store_axes(lanes, lane, voxel, out[1], out[2])
-            solid = masses[0, lane] > 0.0 and area > 0.0
-            out[3][voxel] = masses[0, lane] / area if solid else masses[1, lane]
-
-
-@njit
-def _sum_up(voxel, lane, members, scene, out, lanes, masses):  # type: ignore[no-untyped-def]
-    """Mean and harmonics of one voxel; covariance and mass stay in its lane."""
-    means, quaternions, scales, opacities, sh = scene
-    total = 0.0
-    for leaf in members:
-        total += np.float64(opacities[leaf]) * surface(scales, leaf)
-    mean = np.zeros(3)
-    colours = np.zeros(sh.shape[1:])
-    moments = np.zeros(6)
-    opacity = 0.0
-    for leaf in members:
-        weight = _weight(leaf, total, len(members), scales, opacities)
-        opacity += weight * opacities[leaf]
-        for axis in range(3):
-            mean[axis] += weight * means[leaf, axis]
-            for k in range(sh.shape[1]):
-                colours[k, axis] += weight * sh[leaf, k, axis]
-    for leaf in members:
-        weight = _weight(leaf, total, len(members), scales, opacities)
-        xx, xy, xz, yy, yz, zz = covariance(quaternions, scales, leaf)
-        x, y, z = means[leaf, 0] - mean[0], means[leaf, 1] - mean[1], means[leaf, 2] - mean[2]
-        moments[0] += weight * (xx + x * x)
-        moments[1] += weight * (xy + x * y)
-        moments[2] += weight * (xz + x * z)
-        moments[3] += weight * (yy + y * y)
-        moments[4] += weight * (yz + y * z)
-        moments[5] += weight * (zz + z * z)
-    for k in range(6):
-        lanes[k * LANES + lane] = moments[k]
-    masses[0, lane], masses[1, lane] = total, opacity
-    for axis in range(3):
-        out[0][voxel, axis] = mean[axis]
-        for k in range(sh.shape[1]):
-            out[4][voxel, k, axis] = colours[k, axis]
-
-
-@njit
-def _weight(leaf, total, count, scales, opacities):  # type: ignore[no-untyped-def]
-    """Share of a Gaussian in its voxel."""
-    if total > 0.0:
-        return np.float64(opacities[leaf]) * surface(scales, leaf) / total
-    return 1.0 / count

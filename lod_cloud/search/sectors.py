@@ -21,8 +21,12 @@ Float64 = NDArray[np.float64]
 
 SIDE = 6  # cells along an edge of a cube face
 SECTORS = 6 * SIDE * SIDE
-_WIDENED = 1e-6  # radians; what is lost when a direction is computed and assigned
+_WIDENED = 4e-6  # radians; what is lost when a direction is computed and assigned
 _BEND = 0.2732  # makes cells of a face more alike
+_BEND_32, _RISE_32 = np.float32(_BEND), np.float32(1 + _BEND)
+_SIDE_32, _HALF_SIDE, _LAST = np.float32(SIDE), np.float32(SIDE / 2), np.float32(SIDE - 1)
+_ZERO, _ONE, _TWO, _FOUR = np.float32(0), np.float32(1), np.float32(2), np.float32(4)
+_LEAST = np.float32(1e-30)
 
 
 class SectorTable(NamedTuple):
@@ -67,24 +71,28 @@ def _directions(face: int, first: Float64, second: Float64) -> Float64:
     return out / np.linalg.norm(out, axis=-1, keepdims=True)
 
 
-@njit
+@njit(forceinline=True)
 def _cell(value):  # type: ignore[no-untyped-def]
-    bent = value * (1.0 + _BEND - _BEND * abs(value))
-    return min(SIDE - 1, max(0, int((bent + 1.0) * (0.5 * SIDE))))
+    bent = value * (_RISE_32 - _BEND_32 * abs(value))
+    return min(_LAST, max(_ZERO, np.floor((bent + _ONE) * _HALF_SIDE)))
 
 
-@njit
+@njit(forceinline=True)
 def sector_of(x, y, z):  # type: ignore[no-untyped-def]
-    """Sector of a direction of any length but 0."""
+    """Sector of a direction of any length, in float32; any sector for length 0.
+
+    Without branches, so that it can be computed for many directions at once.
+    """
     ax, ay, az = abs(x), abs(y), abs(z)
-    if ax >= ay and ax >= az:
-        face, scale, first, second = (0 if x > 0 else 1), ax, y, z
-    elif ay >= az:
-        face, scale, first, second = (2 if y > 0 else 3), ay, z, x
-    else:
-        face, scale, first, second = (4 if z > 0 else 5), az, x, y
-    inverse = 1.0 / scale
-    return (face * SIDE + _cell(first * inverse)) * SIDE + _cell(second * inverse)
+    is_x = (ax >= ay) & (ax >= az)
+    is_y = ay >= az
+    along = x if is_x else (y if is_y else z)
+    first = y if is_x else (z if is_y else x)
+    second = z if is_x else (x if is_y else y)
+    face = _ZERO if is_x else (_TWO if is_y else _FOUR)
+    face += _ONE if along < _ZERO else _ZERO
+    inverse = _ONE / max(abs(along), _LEAST)
+    return np.int32((face * _SIDE_32 + _cell(first * inverse)) * _SIDE_32 + _cell(second * inverse))
 
 
 @njit

@@ -49,6 +49,91 @@ def _treelet_of(node, ints, roots):  # type: ignore[no-untyped-def]
     return node
 
 
+@njit
+def _is_valid(ball, cx, cy, cz):  # type: ignore[no-untyped-def]
+    """Whether the camera is where no decision of a treelet can have changed."""
+    dx, dy, dz = cx - ball[0], cy - ball[1], cz - ball[2]
+    return dx * dx + dy * dy + dz * dz < ball[3] * ball[3] * (1.0 - 1e-9)
+
+
+@njit
+def _ask_for(root, bearing, queue, queued):  # type: ignore[no-untyped-def]
+    """Have a treelet tested that bore nothing; returns the new length of the queue."""
+    if is_set(bearing, root):
+        return queued
+    set_bit(bearing, root)
+    queue[queued] = root
+    return queued + 1
+
+
+@njit
+def _test_below(  # type: ignore[no-untyped-def]
+    root, cx, cy, cz, k, grow, floats, ints, roots, refined, bearing, keep,
+    least, stack, opened, n_opened, queue, queued, shut,
+):  # fmt: skip
+    """Test the nodes of a treelet below its refined root, down to where they are not refined.
+
+    Marks those that are refined and asks for the treelets at the ends. Returns whether the treelet
+    bears cut nodes, ``least`` with the margins of those tested, how many were, and the lengths of
+    the lists: opened, queue, and ``shut``, nodes that were refined before.
+    """
+    bears = False
+    stack[0] = root
+    depth, tested, shutting = 1, 0, 0
+    while depth:
+        depth -= 1
+        node = stack[depth]
+        first, count = ints[node, FIRST_CHILD], ints[node, CHILD_COUNT]
+        for child in range(first, first + count):
+            if ints[child, CHILD_COUNT] == 0:
+                bears = True
+                continue
+            tested += 1
+            was = is_set(refined, child)
+            now = _decide(child, cx, cy, cz, floats, k, grow, was)
+            if keep:
+                least = min(least, _margin(child, cx, cy, cz, floats, k, grow, now))
+            if now:
+                if not was:
+                    set_bit(refined, child)
+                    opened[n_opened] = child
+                    n_opened += 1
+                if not is_set(roots, child):
+                    stack[depth] = child
+                    depth += 1
+                elif not was:
+                    queued = _ask_for(child, bearing, queue, queued)
+            else:
+                bears = True
+                if was:
+                    shut[shutting] = child
+                    shutting += 1
+    return bears, least, tested, n_opened, queued, shutting
+
+
+@njit
+def _close(root, ints, roots, refined, shut, shutting, closed, n_closed):  # type: ignore[no-untyped-def]
+    """Nodes in ``shut`` are not refined: nothing below them is, as far as this treelet goes.
+
+    Returns the new length of ``closed``.
+    """
+    while shutting:
+        shutting -= 1
+        node = shut[shutting]
+        if is_set(refined, node) and (node != root or root == 0):
+            clear_bit(refined, node)
+            closed[n_closed] = node
+            n_closed += 1
+        if is_set(roots, node) and node != root:
+            continue
+        first, count = ints[node, FIRST_CHILD], ints[node, CHILD_COUNT]
+        for child in range(first, first + count):
+            if is_set(refined, child):
+                shut[shutting] = child
+                shutting += 1
+    return n_closed
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
 def search_treelets(  # type: ignore[no-untyped-def]
     cx, cy, cz, k, grow, floats, ints, roots, refined, bearing, treelets, balls, keep
@@ -66,92 +151,41 @@ def search_treelets(  # type: ignore[no-untyped-def]
     queue = np.empty(2 * nodes, np.int32)  # a treelet is asked for at most once from each side
     borne = np.empty(nodes, np.int32)
     holds = np.empty((nodes, 4), np.float64)
-    n_opened = n_closed = queued = tested = kept = 0
+    n_opened = n_closed = queued = tested = kept = i = 0
     known = len(treelets)
-    i = 0
     while i < known + queued:
-        if i < known:
-            root = treelets[i]
-            if keep:
-                dx, dy, dz = cx - balls[i, 0], cy - balls[i, 1], cz - balls[i, 2]
-                if dx * dx + dy * dy + dz * dz < balls[i, 3] * balls[i, 3] * (1.0 - 1e-9):
-                    borne[kept] = root
-                    for column in range(4):
-                        holds[kept, column] = balls[i, column]
-                    kept += 1
-                    i += 1
-                    continue
-        else:
-            root = queue[i - known]
+        root = treelets[i] if i < known else queue[i - known]
+        if keep and i < known and _is_valid(balls[i], cx, cy, cz):
+            borne[kept] = root
+            for column in range(4):
+                holds[kept, column] = balls[i, column]
+            kept += 1
+            i += 1
+            continue
         i += 1
-        was = is_set(refined, root)
         tested += 1
+        was = is_set(refined, root)
         now = _decide(root, cx, cy, cz, floats, k, grow, was)
         least = _margin(root, cx, cy, cz, floats, k, grow, now)
         if ints[root, CHILD_COUNT] == 0:
             least = np.inf  # a tree of one leaf: nothing ever changes
-        bears = not now and root == 0
-        depth = shutting = 0
         if now:
-            stack[0] = root
-            depth = 1
             if not was and root == 0:
                 set_bit(refined, root)
                 opened[n_opened] = root
                 n_opened += 1
+            bears, least, below, n_opened, queued, shutting = _test_below(
+                root, cx, cy, cz, k, grow, floats, ints, roots, refined, bearing, keep,
+                least, stack, opened, n_opened, queue, queued, shut,
+            )  # fmt: skip
+            tested += below
         else:
+            bears = root == 0
             shut[0] = root
             shutting = 1
             if root > 0 and was:
-                above = _treelet_of(root, ints, roots)
-                if not is_set(bearing, above):
-                    set_bit(bearing, above)
-                    queue[queued] = above
-                    queued += 1
-        while depth:
-            depth -= 1
-            node = stack[depth]
-            first, count = ints[node, FIRST_CHILD], ints[node, CHILD_COUNT]
-            for child in range(first, first + count):
-                if ints[child, CHILD_COUNT] == 0:
-                    bears = True
-                    continue
-                tested += 1
-                was = is_set(refined, child)
-                now = _decide(child, cx, cy, cz, floats, k, grow, was)
-                if keep:
-                    least = min(least, _margin(child, cx, cy, cz, floats, k, grow, now))
-                if now:
-                    if not was:
-                        set_bit(refined, child)
-                        opened[n_opened] = child
-                        n_opened += 1
-                    if not is_set(roots, child):
-                        stack[depth] = child
-                        depth += 1
-                    elif not was and not is_set(bearing, child):
-                        set_bit(bearing, child)
-                        queue[queued] = child
-                        queued += 1
-                else:
-                    bears = True
-                    if was:
-                        shut[shutting] = child
-                        shutting += 1
-        while shutting:  # these are not refined: nothing below them is, as far as this treelet goes
-            shutting -= 1
-            node = shut[shutting]
-            if is_set(refined, node) and (node != root or root == 0):
-                clear_bit(refined, node)
-                closed[n_closed] = node
-                n_closed += 1
-            if is_set(roots, node) and node != root:
-                continue
-            first, count = ints[node, FIRST_CHILD], ints[node, CHILD_COUNT]
-            for child in range(first, first + count):
-                if is_set(refined, child):
-                    shut[shutting] = child
-                    shutting += 1
+                queued = _ask_for(_treelet_of(root, ints, roots), bearing, queue, queued)
+        n_closed = _close(root, ints, roots, refined, shut, shutting, closed, n_closed)
         if not bears:
             clear_bit(bearing, root)
             continue

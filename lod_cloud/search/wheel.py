@@ -14,7 +14,6 @@ from lod_cloud.search.interface import Search
 from lod_cloud.search.search_tree import SearchTree
 from lod_cloud.search.sectors import SectorTable, sector_table
 from lod_cloud.search.streaming import StreamingSearch
-from lod_cloud.search_arrays import CHILD_COUNT
 
 UNLIMITED = 2**62
 _UNKNOWN_RATE = 0.5  # of a hand of refined nodes, before the first step
@@ -52,6 +51,7 @@ class WheelSearch(Search):
         self._entries = 0
         # room for the worst case; memory is taken by what is written
         self._lists = np.empty((3, len(tree)), np.int32)
+        self._queue = np.empty(2 * len(tree), np.int32)
         self._numbers = np.zeros(3, np.int64)
         self._camera = np.zeros(3, np.float32)
         self._factor = np.float32(0.0)  # k of the last search; of none before the first
@@ -104,8 +104,10 @@ class WheelSearch(Search):
     def _settle(self, due: Int32, budget: int) -> tuple[Int32, Int32, int]:
         """Settle what is due; events in no order, and nodes tested."""
         cx, cy, cz = self._camera
+        self._queue[: len(due)] = due
         tested: int = decisions.settle(
-            due,
+            self._queue,
+            len(due),
             cx,
             cy,
             cz,
@@ -164,7 +166,7 @@ class WheelSearch(Search):
         """As for every search; few nodes are in the cache already, with their records."""
         if len(nodes) > _FEW:
             return super()._growth(nodes)
-        return int(self._ints[nodes, CHILD_COUNT].sum()) - len(nodes)
+        return int(decisions.children_of(nodes, self._ints)) - len(nodes)
 
     @staticmethod
     def _touched(due: int, tested: int) -> int:

@@ -2,20 +2,22 @@
 
 **When a decision can change.** A node was found (not) refined at camera c0, distance D from its
 centre, with threshold t. In float32 the test compares D^2 with an error of at most 5 roundings
-and t^2 with one, so ``|D - t| > t 2^-22`` suffices for the test to agree with real numbers; we
-allow twice that (``_SLACK``). Let v be the way from c0 to a later camera.
+and t^2 with one, so ``|D - t| > t 2^-22`` suffices for the test to agree with real numbers. The
+margin ``|D - t|``, computed in float32 too, is less certain by ``(3.5 D + |D - t|) 2^-24``; we
+subtract ``(D + t) 2^-21`` (``_SLACK``), more than both. Let v be the way from c0 to a later camera.
 
 * *Not refined* (D > t): the new distance is at least ``D - w.v``, where w points from c0 to the
   node. Nothing changes before w.v reaches ``D - t``.
 * *Refined* (D < t): the new distance squared is ``D^2 + 2 D w.v + |v|^2``, w pointing away.
 
 The hand of a sector (see `lod_cloud.search.sectors`) is a running bound on w.v for all w of that
-sector. Hands of the second kind advance by ``max(reach + KAPPA, KAPPA) |step|``: when such a hand
-has advanced by x, the path P is at most x / KAPPA and w.v at most x - KAPPA P. The distance squared
+sector. Hands of the second kind advance by ``max(reach + KAPPA, MU) |step|``: when such a hand
+has advanced by x, the path P is at most x / MU and w.v at most x - KAPPA P. The distance squared
 is then at most ``D^2 + 2 D (x - KAPPA P) + P^2``, convex in P and so largest at P = 0 or at
-P = x / KAPPA. So nothing changes before x = min((t^2 - D^2) / 2 D, KAPPA sqrt(t^2 - D^2)); nor
-before P = t - D: one more hand advances by the length of the path. An entry goes to that of the
-two hands which will take longer if the camera goes on as it did last.
+P = x / MU. So nothing changes before x is the smaller of ``(t^2 - D^2) / 2 D`` and, with
+g = KAPPA - MU, ``MU (g D + sqrt(g^2 D^2 + t^2 - D^2))``; nor before P = t - D: one more hand
+advances by the length of the path. An entry goes to that of the two hands which will take longer
+if the camera goes on as it did last.
 
 **Buckets.** A hand at K pops every entry of key <= K. Near keys go to fine buckets, far ones to
 coarse buckets popped when the hand enters them. Both are rings: what lies more than one turn ahead
@@ -29,57 +31,64 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lod_cloud.search.marks import ONE, is_set, longer
-from lod_cloud.search.prefetching import prefetch
+from lod_cloud.search.marks import ONE, longer
+from lod_cloud.search.prefetching import BATCH, gather, prefetch
 from lod_cloud.search.sectors import SECTORS, reach, sector_of
-from lod_cloud.search_arrays import RECORD_COLUMNS
 
-KAPPA = 0.2
+KAPPA, MU = 0.1, 0.05
 HANDS = 2 * SECTORS + 1  # hand 2 j + kind belongs to sector j; the last one moves with the path
 FINE_M, FINE = 2.0**-7, 8  # width and number of fine buckets of a hand: one coarse bucket
 COARSE_M, COARSE = 2.0**-4, 512
+FINE_BITS = 3  # FINE = 2^3
 RING = FINE + COARSE
 BUCKETS = HANDS * RING + 1  # the last one is popped at every search
 PER_CHUNK = 15  # node ids in a chunk of 64 bytes; its first number is the next chunk
 FREE, USED = 0, 1  # places in ``counts``: first free chunk, chunks ever used
-_SLACK = 2.0**-21
-_TINY = 1e-15  # metres; squares of less may vanish in float32
-_BATCH = 256
-_AHEAD, _NEAR = 24, 12  # nodes whose numbers, and whose chunks, are asked for in advance
+_SLACK = np.float32(2.0**-21)
+_TINY = np.float32(1e-15)  # metres; squares of less may vanish in float32
+_ZERO, _LITTLE, _LEAST = np.float32(0), np.float32(1e-3), np.float32(1e-30)
+_MU, _GAIN = np.float32(MU), np.float32(KAPPA - MU)
+_NEAR = 12  # nodes whose chunk is asked for in advance
 
 
 @njit(forceinline=True)
-def _bucket(hands, rates, refined, dx, dy, dz, t):  # type: ignore[no-untyped-def]
-    """Bucket of a node seen from (dx, dy, dz) away (camera minus centre), threshold t."""
-    d2 = dx * dx + dy * dy + dz * dz
-    d = np.sqrt(d2)
-    slack = t * _SLACK + _TINY
-    margin = (t - d if refined else d - t) - slack
-    if margin <= 0.0 or d == 0.0:
-        return BUCKETS - 1
-    if refined:
-        inner = t - slack
-        room = inner * inner - d2
-        straight = min(room / (2.0 * d), KAPPA * np.sqrt(room))
-        hand = 2 * sector_of(dx, dy, dz) + 1
-        if straight > margin * rates[hand]:
-            margin = straight
-        else:
-            hand = HANDS - 1
-    else:
-        hand = 2 * sector_of(-dx, -dy, -dz)
-    now = hands[hand]
-    # the differences above and the sum below are good to 1e-15 of the larger number
-    farthest = now + 2.0 * COARSE * COARSE_M
-    key = min(now + margin * (1.0 - 1e-9) - abs(now) * 1e-15, farthest)
-    if key <= now:
-        return BUCKETS - 1
-    fine = int(np.floor(key * (1.0 / FINE_M)))
-    if fine - int(np.floor(now * (1.0 / FINE_M))) < FINE:
-        return hand * RING + (fine & (FINE - 1))
-    here = int(np.floor(now * (1.0 / COARSE_M)))
-    coarse = min(int(np.floor(key * (1.0 / COARSE_M))), here + COARSE - 1)
-    return hand * RING + FINE + (coarse & (COARSE - 1))
+def _keys(held, cx, cy, cz, k, grow, rows, was, margins, ways, sectors):  # type: ignore[no-untyped-def]
+    """For a batch of nodes: how far to go before the decision can change, in any direction
+    (``margins``) and by the hand of a sector (``ways``), and which hand that is.
+
+    In float32 and without branches: a compiler makes vector instructions of it.
+    """
+    for i in range(held):
+        scale = grow if was[i] else ONE
+        t = scale * rows[3, i] + (scale * k) * rows[4, i]
+        dx, dy, dz = cx - rows[0, i], cy - rows[1, i], cz - rows[2, i]
+        d = np.sqrt((dx * dx + dy * dy) + dz * dz)
+        margin = (t - d if was[i] else d - t) - ((t + d) * _SLACK + _TINY)
+        room = max(margin * (margin + (d + d)), _ZERO)  # t^2 - D^2
+        bent = d * _GAIN
+        straight = min(
+            room / max(d + d, margin * _LITTLE, _LEAST),
+            _MU * (bent + np.sqrt(bent * bent + room)),
+        )
+        margins[i] = margin
+        ways[i] = straight if was[i] else margin
+        sign = ONE if was[i] else -ONE
+        sectors[i] = np.int32(2) * sector_of(sign * dx, sign * dy, sign * dz) + np.int32(was[i])
+
+
+@njit(forceinline=True)
+def _bucket(margin, way, sector, hands, rates):  # type: ignore[no-untyped-def]
+    """Where an entry waits: in a bucket of the hand that will take longer."""
+    hand, far = np.intp(sector), np.float64(way)
+    if far < margin * rates[hand]:
+        hand, far = HANDS - 1, np.float64(margin)
+    now = hands[hand] * (1.0 / FINE_M)
+    # the way is at most 9 roundings of float32 too long; the sum is good to 1e-15 of ``now``
+    key = now - abs(now) * 1e-15 + min(far * ((1.0 - 1e-6) / FINE_M), 2.0 * COARSE * FINE)
+    here, fine = np.int64(np.floor(now)), np.int64(np.floor(key))
+    coarse = min(fine >> FINE_BITS, (here >> FINE_BITS) + COARSE - 1)
+    place = fine & (FINE - 1) if fine - here < FINE else FINE + (coarse & (COARSE - 1))
+    return hand * RING + place if margin > 0 and key > now else BUCKETS - 1
 
 
 @njit
@@ -90,7 +99,7 @@ def _set_rates(step, length, rates, axes, cosines, sines):  # type: ignore[no-un
         along = axes[j, 0] * step[0] + axes[j, 1] * step[1] + axes[j, 2] * step[2]
         advance = reach(along / length, cosines[j], sines[j])
         rates[2 * j] = advance
-        rates[2 * j + 1] = max(advance + KAPPA, KAPPA)
+        rates[2 * j + 1] = max(advance + KAPPA, MU)
 
 
 @njit(forceinline=True)
@@ -162,34 +171,26 @@ def _release(counts, chunks, taken):  # type: ignore[no-untyped-def]
     return due[:found]
 
 
-@njit(forceinline=True)
-def _bucket_of(node, cx, cy, cz, k, grow, floats, refined, hands, rates):  # type: ignore[no-untyped-def]
-    was = is_set(refined, node)
-    scale = grow if was else ONE
-    t = scale * floats[node, 3] + (scale * k) * floats[node, 4]
-    dx = np.float64(cx) - np.float64(floats[node, 0])
-    dy = np.float64(cy) - np.float64(floats[node, 1])
-    dz = np.float64(cz) - np.float64(floats[node, 2])
-    return _bucket(hands, rates, was, dx, dy, dz, np.float64(t))
-
-
 @njit(cache=True, error_model="numpy", nogil=True)
 def insert(nodes, cx, cy, cz, k, grow, floats, refined, hands, rates, heads, counts, chunks):  # type: ignore[no-untyped-def]
     """Make an entry for each node, whose decision is known. There must be chunks enough for all.
 
     In batches: the buckets of all of a batch are found first, so that they can be asked for.
     """
-    buckets = np.empty(_BATCH, np.intp)
-    for begin in range(0, len(nodes), _BATCH):
-        batch = nodes[begin : begin + _BATCH]
-        for i in range(len(batch)):
-            if begin + i + _AHEAD < len(nodes):
-                prefetch(floats, np.intp(nodes[begin + i + _AHEAD]) * RECORD_COLUMNS)
-            bucket = _bucket_of(batch[i], cx, cy, cz, k, grow, floats, refined, hands, rates)
+    rows = np.zeros((5, BATCH), np.float32)
+    was = np.zeros(BATCH, np.bool_)
+    margins, ways = np.empty(BATCH, np.float32), np.empty(BATCH, np.float32)
+    sectors = np.empty(BATCH, np.int32)
+    buckets = np.empty(BATCH, np.intp)
+    for begin in range(0, len(nodes), BATCH):
+        held = gather(nodes, begin, len(nodes), floats, refined, rows, was)
+        _keys(held, cx, cy, cz, k, grow, rows, was, margins, ways, sectors)
+        for i in range(held):
+            bucket = _bucket(margins[i], ways[i], sectors[i], hands, rates)
             buckets[i] = bucket
             prefetch(heads, bucket)
-        for i in range(len(batch)):
-            if i + _NEAR < len(batch):
+        for i in range(held):
+            if i + _NEAR < held:
                 later = max(heads[buckets[i + _NEAR]], 0) >> 4
                 prefetch(chunks, np.intp(later) * (PER_CHUNK + 1))
             head = heads[buckets[i]]
@@ -203,5 +204,5 @@ def insert(nodes, cx, cy, cz, k, grow, floats, refined, hands, rates, heads, cou
                 chunks[fresh, 0] = head >> 4
                 head = fresh << 4
             head += 1
-            chunks[head >> 4, head & 15] = batch[i]
+            chunks[head >> 4, head & 15] = nodes[begin + i]
             heads[buckets[i]] = head

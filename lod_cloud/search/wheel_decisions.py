@@ -11,44 +11,68 @@ import numpy as np
 from numba import njit
 
 from lod_cloud.search.marks import any_set, clear_bit, is_set, longer, set_bit, stays_refined
-from lod_cloud.search.prefetching import prefetch
+from lod_cloud.search.prefetching import BATCH, gather, prefetch
 from lod_cloud.search_arrays import CHILD_COUNT, FIRST_CHILD, PARENT, RECORD_COLUMNS
 
 OPENED, CLOSED, WAITING = 0, 1, 2  # rows of ``lists``
-_AHEAD, _NEAR = 24, 12  # nodes whose record, and whose neighbours' marks, are asked for in advance
+_ROOT, _ONE_NODE = np.int32(0), np.int32(1)
+_NEAR = 12  # nodes whose neighbours' marks are asked for in advance
 
 
 @njit(forceinline=True)
-def _test(node, cx, cy, cz, floats, k, grow, was):  # type: ignore[no-untyped-def]
-    return stays_refined(
-        cx, cy, cz, floats[node, 0], floats[node, 1], floats[node, 2],
-        floats[node, 3], floats[node, 4], k, grow, was,
-    )  # fmt: skip
+def _is_active(node, is_refined, ints, refined):  # type: ignore[no-untyped-def]
+    """Whether no child of a refined node is refined, or the parent of another one is (the root has
+    none). Without branches: what comes next in a list is hard to predict.
+    """
+    above = ints[node, PARENT]
+    first = ints[node, FIRST_CHILD] if is_refined else max(above, _ROOT)
+    count = ints[node, CHILD_COUNT] if is_refined else _ONE_NODE
+    if count > 8:
+        return not any_set(refined, first, count)
+    at = np.intp(first >> 3)
+    marks = np.int64(refined[at]) | np.int64(refined[min(at + 1, len(refined) - 1)]) << 8
+    found = (marks >> (first & 7)) & ((1 << count) - 1)
+    return ((found != 0) != is_refined) | ((above < 0) & (not is_refined))
 
 
 @njit(forceinline=True)
-def _is_active(node, ints, refined):  # type: ignore[no-untyped-def]
-    if is_set(refined, node):
-        return not any_set(refined, ints[node, FIRST_CHILD], ints[node, CHILD_COUNT])
-    return ints[node, PARENT] < 0 or is_set(refined, ints[node, PARENT])
+def _compare(held, cx, cy, cz, k, grow, rows, was, changed):  # type: ignore[no-untyped-def]
+    """Which nodes of a batch decide otherwise than before."""
+    for i in range(held):
+        now = stays_refined(
+            cx, cy, cz, rows[0, i], rows[1, i], rows[2, i], rows[3, i], rows[4, i], k, grow, was[i]
+        )  # fmt: skip
+        changed[i] = now != was[i]
 
 
 @njit(forceinline=True)
-def _ask_for(due, i, floats, ints, refined, scheduled):  # type: ignore[no-untyped-def]
-    """Ask for the record of a node due later, and for what is looked at about one due sooner."""
-    if i + _AHEAD < len(due):
-        later = np.intp(due[i + _AHEAD])
-        prefetch(floats, later * RECORD_COLUMNS)
-        prefetch(scheduled, later >> 3)
-        prefetch(refined, later >> 3)
-    if i + _NEAR < len(due):
-        near = due[i + _NEAR]
-        above, below = max(ints[near, PARENT], 0), ints[near, FIRST_CHILD]
-        prefetch(refined, np.intp(above >> 3))
-        prefetch(refined, np.intp(below >> 3))
-        prefetch(scheduled, np.intp(below >> 3))
-        follower = above if is_set(refined, near) else below
-        prefetch(floats, np.intp(follower) * RECORD_COLUMNS)
+def _sift(nodes, was, changed, ints, refined, special, waiting):  # type: ignore[no-untyped-def]
+    """Move the nodes of a batch to ``waiting``, but for those that change or are not active; the
+    places of these in the batch go to ``special``. How many there are of the latter.
+    """
+    for i in range(len(nodes)):
+        node = nodes[i]
+        near = ints[node, FIRST_CHILD] if was[i] else max(ints[node, PARENT], _ROOT)
+        prefetch(refined, np.intp(near >> 3))
+    stayed = found = 0
+    for i in range(len(nodes)):
+        stays = _is_active(nodes[i], was[i], ints, refined) & (not changed[i])
+        waiting[stayed] = nodes[i]
+        stayed += np.int64(stays)
+        special[found] = i
+        found += np.int64(not stays)
+    return found
+
+
+@njit(forceinline=True)
+def _ask_for_neighbours(node, was, ints, scheduled):  # type: ignore[no-untyped-def]
+    """Ask for what is looked at when a node changes its decision."""
+    first = max(ints[node, PARENT], _ROOT) if was else ints[node, FIRST_CHILD]
+    last = first if was else first + ints[node, CHILD_COUNT] - 1
+    prefetch(scheduled, np.intp(node >> 3))
+    prefetch(scheduled, np.intp(first >> 3))
+    prefetch(ints, np.intp(first) * RECORD_COLUMNS)
+    prefetch(ints, np.intp(last) * RECORD_COLUMNS)
 
 
 @njit(forceinline=True)
@@ -58,95 +82,85 @@ def _append(node, which, lists, counts):  # type: ignore[no-untyped-def]
 
 
 @njit(forceinline=True)
-def _schedule(node, scheduled, lists, counts):  # type: ignore[no-untyped-def]
-    set_bit(scheduled, node)
+def _collapse(node, ints, refined, scheduled, lists, counts, queue, tail):  # type: ignore[no-untyped-def]
+    """Collapse a node; its parent may be due then. The end of the queue."""
+    clear_bit(refined, node)
+    _append(node, CLOSED, lists, counts)
     _append(node, WAITING, lists, counts)
+    above = ints[node, PARENT]
+    if above >= 0 and not is_set(scheduled, above) and _is_active(above, True, ints, refined):
+        set_bit(scheduled, above)
+        queue[tail] = above
+        tail += 1
+    return tail
+
+
+@njit(forceinline=True)
+def _expand(node, ints, refined, scheduled, lists, counts, queue, tail):  # type: ignore[no-untyped-def]
+    """Expand a node; its children are due then. The end of the queue."""
+    set_bit(refined, node)
+    clear_bit(scheduled, node)
+    _append(node, OPENED, lists, counts)
+    first = ints[node, FIRST_CHILD]
+    for child in range(first, first + ints[node, CHILD_COUNT]):
+        if ints[child, CHILD_COUNT] and not is_set(scheduled, child):
+            set_bit(scheduled, child)
+            queue[tail] = child
+            tail += 1
+    return tail
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def settle(  # type: ignore[no-untyped-def]
-    due, cx, cy, cz, k, grow, floats, ints, refined, scheduled, budget, lists, counts
+    queue, due, cx, cy, cz, k, grow, floats, ints, refined, scheduled, budget, lists, counts
 ):
-    """Test the nodes that are due and everything that follows from those that change.
+    """Test the first ``due`` nodes of a queue and everything that follows from those that change.
 
     Writes expanded, collapsed (in no order) and nodes to insert to ``lists`` [3, nodes], their
     numbers to ``counts``; returns the number of nodes tested. Stops, with nothing in order but the
     two lists of events, once more than ``budget`` nodes have been tested.
+
+    In batches. Nobody else changes the decision of a node that is due, so all of a batch are
+    tested at once; whether they are active may change while others of the batch are looked at.
+    What becomes due is put at the end of the queue, which has room for 2 N: no node twice, but
+    for those that were due before and not active.
     """
+    rows = np.zeros((5, BATCH), np.float32)
+    was, changed = np.zeros(BATCH, np.bool_), np.zeros(BATCH, np.bool_)
+    special = np.empty(BATCH, np.intp)
+    head, tail = 0, due
     counts[:] = 0
     tested = 0
-    for i in range(len(due)):
-        _ask_for(due, i, floats, ints, refined, scheduled)
-        node = due[i]
-        clear_bit(scheduled, node)
-        if not _is_active(node, ints, refined):
-            continue
-        tested += 1
-        was = is_set(refined, node)
-        if _test(node, cx, cy, cz, floats, k, grow, was) == was:
-            _schedule(node, scheduled, lists, counts)
-            continue
-        if tested > budget:
-            break
-        if was:
-            tested += _collapse(
-                node, cx, cy, cz, k, grow, floats, ints, refined, scheduled, lists, counts
-            )
-        else:
-            tested += _expand(
-                node, cx, cy, cz, k, grow, floats, ints, refined, scheduled, budget - tested,
-                lists, counts,
-            )  # fmt: skip
-    return tested
-
-
-@njit(forceinline=True)
-def _collapse(node, cx, cy, cz, k, grow, floats, ints, refined, scheduled, lists, counts):  # type: ignore[no-untyped-def]
-    """Collapse a node, and upwards as far as it goes; nodes tested."""
-    tested = 0
-    while True:
-        clear_bit(refined, node)
-        _append(node, CLOSED, lists, counts)
-        _schedule(node, scheduled, lists, counts)
-        node = ints[node, PARENT]
-        if node < 0 or is_set(scheduled, node) or any_set(
-            refined, ints[node, FIRST_CHILD], ints[node, CHILD_COUNT]
-        ):  # fmt: skip
-            return tested
-        tested += 1
-        if _test(node, cx, cy, cz, floats, k, grow, True):
-            _schedule(node, scheduled, lists, counts)
-            return tested
-
-
-@njit(forceinline=True)
-def _expand(  # type: ignore[no-untyped-def]
-    node, cx, cy, cz, k, grow, floats, ints, refined, scheduled, budget, lists, counts
-):
-    """Expand a node, and downwards as far as it goes or until more than ``budget`` nodes have been
-    tested; nodes tested.
-    """
-    tested = 0
-    at = counts[OPENED]  # nodes from here on were opened, and their children not looked at
-    set_bit(refined, node)
-    _append(node, OPENED, lists, counts)
-    while at < counts[OPENED] and tested <= budget:
-        node = lists[OPENED, at]
-        at += 1
-        first, count = ints[node, FIRST_CHILD], ints[node, CHILD_COUNT]
-        any_refined = False
-        for child in range(first, first + count):
-            if ints[child, CHILD_COUNT] == 0 or is_set(scheduled, child):
+    while head < tail and tested <= budget:
+        held = gather(queue, head, tail, floats, refined, rows, was)
+        batch = queue[head : head + held]
+        head += held
+        _compare(held, cx, cy, cz, k, grow, rows, was, changed)
+        found = _sift(
+            batch, was, changed, ints, refined, special, lists[WAITING, counts[WAITING] :]
+        )
+        counts[WAITING] += held - found
+        tested += held - found
+        for i in range(found):
+            place, later = special[i], special[min(i + _NEAR, found - 1)]
+            _ask_for_neighbours(batch[later], was[later], ints, scheduled)
+            node = batch[place]
+            if not _is_active(node, was[place], ints, refined):
+                clear_bit(scheduled, node)
                 continue
             tested += 1
-            if _test(child, cx, cy, cz, floats, k, grow, False):
-                any_refined = True
-                set_bit(refined, child)
-                _append(child, OPENED, lists, counts)
+            if tested > budget:
+                break
+            if not changed[place]:
+                _append(node, WAITING, lists, counts)
+            elif was[place]:
+                tail = _collapse(node, ints, refined, scheduled, lists, counts, queue, tail)
             else:
-                _schedule(child, scheduled, lists, counts)
-        if not any_refined:
-            _schedule(node, scheduled, lists, counts)
+                tail = _expand(node, ints, refined, scheduled, lists, counts, queue, tail)
+    for node in lists[OPENED, : counts[OPENED]]:
+        if _is_active(node, True, ints, refined) and not is_set(scheduled, node):
+            set_bit(scheduled, node)
+            _append(node, WAITING, lists, counts)
     return tested
 
 
@@ -208,7 +222,7 @@ def active_among(nodes, ints, refined, scheduled):  # type: ignore[no-untyped-de
                 near >= 0
                 and ints[near, CHILD_COUNT]
                 and not is_set(scheduled, near)
-                and _is_active(near, ints, refined)
+                and _is_active(near, is_set(refined, near), ints, refined)
             ):
                 set_bit(scheduled, near)
                 waiting[made] = near
@@ -224,3 +238,12 @@ def set_marks(nodes, marks, value):  # type: ignore[no-untyped-def]
             set_bit(marks, node)
         else:
             clear_bit(marks, node)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def children_of(nodes, ints):  # type: ignore[no-untyped-def]
+    """How many children nodes have together."""
+    total = 0
+    for node in nodes:
+        total += ints[node, CHILD_COUNT]
+    return total

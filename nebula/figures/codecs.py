@@ -12,7 +12,7 @@ CODECS = ("paper", "compact")
 
 
 def train_codecs(tree: LodTree, seed: int) -> dict[str, Codec]:
-    """Every codec by name, trained on the tree with the session's size of codebook."""
+    """Every codec by name, trained on the tree with its size of codebook in configs/session."""
     config = load_session_config()
     codecs: dict[str, Codec] = {}
     with progress("training codebooks", len(CODECS)) as step:

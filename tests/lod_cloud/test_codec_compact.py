@@ -14,10 +14,12 @@ from hypothesis import strategies as st
 
 from gaussians import parallel
 from gaussians.codebook import AC_ERROR
+from gaussians.errors import InputError
 from gaussians.scene import FIELDS
 from lod_cloud.build import BuildOptions, build_tree
-from lod_cloud.codec import CompactCodec, Encoded, References, read_codec
+from lod_cloud.codec import CompactCodec, Encoded, References, compact, read_codec, training
 from lod_cloud.codec.axes import sorted_axes
+from lod_cloud.codec.rans import Frequencies
 from lod_cloud.codec.tolerance import CODED_MASS_ERROR
 from lod_cloud.criterion import SearchRequest
 from lod_cloud.lod_tree import LodTree
@@ -56,14 +58,15 @@ def test_round_trip(count: int, seed: int, sh_degree: int) -> None:
     old, new = original.gaussians, decoded.gaussians
     off = np.abs(new.means.astype(float) - old.means)
     assert (
-        off <= codec.position.max_error * old.scales.max(axis=1, keepdims=True, initial=0)
+        off <= codec.fields.position.max_error * old.scales.max(axis=1, keepdims=True, initial=0)
     ).all()
     assert np.abs(masses(decoded) - masses(original)).max(initial=0) <= (
         CODED_MASS_ERROR * masses(original).max(initial=0)
     )
     assert (np.abs(masses(decoded) - masses(original)) <= 0.0901 * masses(original)).all()
     assert np.abs(new.sh[:, 1:] - old.sh[:, 1:]).max(initial=0) <= AC_ERROR
-    assert np.abs(new.sh[:, 0].astype(float) - old.sh[:, 0]).max(initial=0) <= codec.dc.max_error
+    off = np.abs(new.sh[:, 0].astype(float) - old.sh[:, 0])
+    assert off.max(initial=0) <= codec.fields.dc.max_error
     assert (decoded.radius >= original.radius).all()
     assert (decoded.extent >= original.extent).all()
     assert encoded.sent == len(ids)
@@ -111,6 +114,17 @@ def test_any_reference_within_the_tolerance_gives_the_same_bits(seed: int, bits:
     for name in FIELDS:
         assert np.array_equal(getattr(got, name), getattr(right, name))
     assert encoder.codec is codec
+
+
+def test_positions_are_told_from_the_node_before_where_nothing_is_held() -> None:
+    """32 bits per axis, and few for a sibling."""
+    tree = random_tree(3000, 2)
+    codec = CompactCodec.train(tree, 1, words=8)
+    leaves = np.sort(tree.leaf_nodes())
+    alone = coded(tree, codec, leaves[:1])[1].columns["position"]
+    together = coded(tree, codec, leaves)[1].columns["position"]
+    assert 12 <= alone <= 16
+    assert together < 8 * len(leaves)
 
 
 def world_of(tree: LodTree, codec: CompactCodec, seed: int) -> World:
@@ -196,7 +210,7 @@ def test_interior_nodes_that_are_no_merges_are_sent() -> None:
 
 def test_the_tolerance_is_what_the_text_says() -> None:
     codec = CompactCodec.train(random_tree(100, 1), 1, words=8)
-    assert codec.position.max_error == 1 / 64
+    assert codec.fields.position.max_error == 1 / 64
     assert 0.2 < codec.tolerance < 0.33
     assert dataclasses.replace(codec, merge_levels=31).tolerance < 0.33
 
@@ -213,6 +227,86 @@ def test_parameters_round_trip() -> None:
         read_codec(codec.to_bytes()[:-1])
     with pytest.raises(RemoteProtocolError, match="must be complete"):
         read_codec(codec.to_bytes().replace(b'"dc"', b'"cd"'))
+
+
+def equal_frequencies(codec: CompactCodec) -> CompactCodec:
+    none = np.empty(0, np.int64)
+    shapes = codec.layout.shapes().items()
+    tables = {key: Frequencies.counted(none, none, shape) for key, shape in shapes}
+    return dataclasses.replace(codec, tables=tables)
+
+
+@given(st.integers(1, 200), SEEDS, st.sampled_from([0, 1, 3]))
+@settings(max_examples=15)
+def test_frequencies_change_the_bytes_and_nothing_else(
+    count: int, seed: int, sh_degree: int
+) -> None:
+    tree = random_tree(count, seed, sh_degree=sh_degree)
+    codec = CompactCodec.train(tree, seed, words=5)
+    ids = np.arange(len(tree))
+    right, got = (coded(tree, one, ids)[0] for one in (codec, equal_frequencies(codec)))
+    for name in FIELDS:
+        assert np.array_equal(getattr(got.gaussians, name), getattr(right.gaussians, name))
+    assert np.array_equal(got.radius, right.radius)
+    assert np.array_equal(got.extent, right.extent)
+
+
+def test_frequencies_of_the_tree_save_bytes() -> None:
+    tree = random_tree(2000, 7)
+    codec = CompactCodec.train(tree, 1, words=64, stages=2)
+    ids = np.arange(len(tree))
+    learnt, plain = (coded(tree, one, ids)[1].columns for one in (codec, equal_frequencies(codec)))
+    for name in ("scale", "rotation", "colour", "spheres"):
+        assert learnt[name] < 0.97 * plain[name]
+    assert learnt["harmonics"] < plain["harmonics"]
+
+
+def test_the_coarsest_nodes_are_no_escapes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a tree of which training sees a part."""
+    tree = random_tree(4000, 5)
+    monkeypatch.setattr(training, "WHOLE_NODES", 1000)
+    monkeypatch.setattr(training, "RANGE_NODES", 512)
+    ids = np.arange(60)
+    codec = CompactCodec.train(tree, 1, words=8)
+    assert coded(tree, codec, ids)[1].escapes <= 3
+    monkeypatch.setattr(compact, "_COARSEST_NODES", 0)
+    assert coded(tree, CompactCodec.train(tree, 1, words=8), ids)[1].escapes >= 20
+
+
+def test_books_of_more_words_than_symbols() -> None:
+    """The lowest bits travel as they are."""
+    tree = random_tree(12_000, 3, sh_degree=1)
+    codec = CompactCodec.train(tree, 1, words=2500, stages=1)
+    assert codec.codebook is not None
+    words = len(codec.codebook.stages[0])
+    assert words > 2048
+    assert codec.layout.words == ((-(-words // 4), 2),)
+    ids = np.arange(0, len(tree), 3, dtype=np.int32)
+    found, near = codec.assign_words(tree, ids)
+    decoded, _ = coded(tree, codec, ids)
+    right = codec.codebook.decode(found).reshape(len(ids), 3, 3)
+    assert near.any()
+    assert np.array_equal(decoded.gaussians.sh[near, 1:], right[near])
+
+
+def test_frequencies_of_a_session_start_are_checked() -> None:
+    codec = CompactCodec.train(random_tree(60, 4), 1, words=8)
+    data = codec.to_bytes()
+    axis = str(codec.tables["rotation.axis"].table.tolist()).encode()
+    for wrong, text in (
+        (b"[[4096, 0, 0, 0], [1024, 1024, 1024, 1024]]", "at least 1"),
+        (b"[[4093, 1, 1, 1]]", "frequencies of rotation.axis must be 2 x 4"),
+        (b"7", "1 to 1024 symbols"),
+        (b"[[1, 2], [3]]", "must be complete"),
+    ):
+        assert data.count(axis) == 1
+        size = int.from_bytes(data[:4], "little") + len(wrong) - len(axis)
+        with pytest.raises(RemoteProtocolError, match=text):
+            read_codec(size.to_bytes(4, "little") + data[4:].replace(axis, wrong))
+    with pytest.raises(RemoteProtocolError, match="must be complete"):
+        read_codec(data.replace(b'"spheres.extent"', b'"spheres.extant"'))
+    with pytest.raises(InputError, match="colour bits must be 1 to 10"):
+        CompactCodec.train(random_tree(60, 4), 1, words=8, colour_bits=11)
 
 
 @pytest.mark.parametrize("colour_bits", [8, 10])

@@ -1,0 +1,156 @@
+"""Codes of everything but the harmonics above degree 0, and the columns in which they travel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lod_cloud.codec.positions import CHOICES
+from lod_cloud.codec.rans import MOST_SYMBOLS
+from lod_cloud.codec.shapes import BYTE, SPHERE, WIDE
+
+Mask = NDArray[np.bool_]
+Column = NDArray[Any]  # [N] whole numbers
+
+_AXES = 4
+_BYTES = BYTE + 1
+_MOST_BITS = MOST_SYMBOLS.bit_length() - 1
+_COARSE = 8  # contexts that a byte gives, by its three highest bits
+
+
+class Coder(Protocol):
+    """What one column of a payload goes through: counted, pushed or pulled."""
+
+    def __call__(
+        self, key: str, shape: tuple[int, int], contexts: Column, values: Column | None, /
+    ) -> Column:
+        """The symbols [N] of column ``key`` in ``contexts`` [N]; they are ``values`` where these
+        are known. ``shape``: number of contexts, of symbols.
+        """
+
+
+@dataclass(frozen=True)
+class Rows:
+    """What both ends know of nodes [N] before they code them."""
+
+    inner: Mask  # not leaves
+    siblings: Mask  # child of the same parent as the node before
+
+    @classmethod
+    def of(cls, inner: Mask, parents: Column) -> Rows:
+        """Nodes in the order of their ids."""
+        return cls(inner, np.diff(parents, prepend=-2) == 0)
+
+
+class _Columns:
+    """Calls a coder for one column after the other. A column's contexts follow from the columns
+    before it; no column depends on another payload.
+    """
+
+    def __init__(self, code: Coder, rows: Rows, given: Mapping[str, Column] | None = None) -> None:
+        self._code, self._given = code, given
+        self.values: dict[str, Column] = {}
+        self._inner = rows.inner.astype(np.int64)
+        self._place = self._inner + 2 * rows.siblings
+        self._rows = rows
+
+    def plain(self, key: str, symbols: int, contexts: Column, count: int) -> Column:
+        """Values below ``symbols`` in one of ``count`` contexts."""
+        given = None if self._given is None else self._given[key]
+        self.values[key] = self._code(key, (count, symbols), contexts, given)
+        return self.values[key].astype(np.int64)
+
+    def stepped(self, key: str, symbols: int) -> Column:
+        """Differences to the node before, modulo ``symbols``; by whether the two are siblings."""
+        given = None
+        if self._given is not None:
+            steps: Column = np.diff(self._given[key].astype(np.int64), prepend=0)
+            given = steps % symbols
+        steps = self._code(key, (4, symbols), self._place, given)
+        self.values[key] = np.cumsum(steps, dtype=np.int64) % symbols
+        return self.values[key]
+
+    def shape(self) -> None:
+        """Scales and rotation."""
+        inner = self._inner
+        self.stepped("scale.0", WIDE + 1)
+        ratio = self.plain("scale.1", _BYTES, inner, 2)
+        self.plain("scale.2", _BYTES, inner + 2 * _coarse(ratio), 2 * _COARSE)
+        axis = self.plain("rotation.axis", _AXES, inner, 2)
+        one = self.plain("rotation.0", _BYTES, inner + 2 * axis, 2 * _AXES)
+        two = self.plain("rotation.1", _BYTES, _coarse(one) + _COARSE * axis, _COARSE * _AXES)
+        self.plain("rotation.2", _BYTES, _coarse(two) + _COARSE * axis, _COARSE * _AXES)
+
+    def look(self, colours: int) -> None:
+        """Opacity, and green and what red and blue differ from it by."""
+        self.plain("opacity", WIDE + 1, self._inner, 2)
+        for key in ("colour.green", "colour.red", "colour.blue"):
+            self.stepped(key, colours)
+
+    def spheres(self) -> None:
+        """Of inner nodes."""
+        radius = self.plain("spheres.radius", SPHERE + 1, self._inner[self._rows.inner] * 0, 1)
+        self.plain("spheres.extent", SPHERE + 1, radius, SPHERE + 1)
+
+    def position(self) -> None:
+        """How the lowest bits of a position are to be read."""
+        self.plain("position", CHOICES, self._place, 4)
+
+    def words(self, symbols: Sequence[int]) -> None:
+        """Of the stages of a codebook, each of so many symbols."""
+        for stage, count in enumerate(symbols):
+            self.plain(f"harmonics.{stage}", count, self._inner, 2)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """All columns of a payload."""
+
+    colours: int  # codes of a channel
+    words: tuple[tuple[int, int], ...]  # of every stage: symbols, lowest bits that are none
+
+    @classmethod
+    def of(cls, colours: int, sizes: Sequence[int]) -> Layout:
+        """For stages of so many words; the lowest bits of large numbers travel as they are."""
+        lows = [max(0, (size - 1).bit_length() - _MOST_BITS) for size in sizes]
+        split = [(((size - 1) >> low) + 1, low) for size, low in zip(sizes, lows, strict=True)]
+        return cls(colours, tuple(split))
+
+    def high_parts(self, words: NDArray[np.uint16]) -> dict[str, Column]:
+        """What of words [N, stages] are symbols."""
+        return {f"harmonics.{i}": words[:, i] >> low for i, (_, low) in enumerate(self.words)}
+
+    def pass_through(
+        self,
+        code: Coder,
+        rows: Sequence[Rows],
+        given: Mapping[str, Column] | None,
+    ) -> dict[str, Column]:
+        """All columns: of the nodes whose fields are coded, and of those whose harmonics are."""
+        fields, harmonics = (_Columns(code, some, given) for some in rows)
+        fields.shape()
+        fields.look(self.colours)
+        fields.spheres()
+        fields.position()
+        harmonics.words([symbols for symbols, _ in self.words])
+        return fields.values | harmonics.values
+
+    def shapes(self) -> dict[str, tuple[int, int]]:
+        """Number of contexts and of symbols of every column."""
+        shapes = {}
+
+        def note(key: str, shape: tuple[int, int], _: Column, __: Column | None, /) -> Column:
+            shapes[key] = shape
+            return np.empty(0, np.int64)
+
+        nothing = np.zeros(0, np.bool_)
+        self.pass_through(note, [Rows(nothing, nothing)] * 2, None)
+        return shapes
+
+
+def _coarse(values: Column) -> Column:
+    return values // (_BYTES // _COARSE)

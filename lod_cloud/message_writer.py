@@ -1,0 +1,155 @@
+"""Writes the messages of a session: what is to be told, from which state on. Changes nothing.
+
+Which kind of message is due, and whether what was written is sent, is up to `lod_cloud.cloud`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lod_cloud.codec import NOTHING_CODED, Encoded
+from lod_cloud.delta_cut import DeltaCut, Probe
+from lod_cloud.events import Events
+from lod_cloud.journal import Entry, Journal
+from lod_cloud.lod_tree import Int32
+from lod_cloud.management_table import ManagementTable, TableChange
+from lod_cloud.pacing import Portion
+from lod_cloud.protocol import DELTA_CUT, PROBE, seal
+from lod_cloud.search import SearchTree
+from lod_cloud.search.events import nodes_that_entered
+from lod_cloud.search_stats import MessageKind
+from lod_cloud.tree_encoder import TreeEncoder
+
+_NOTHING = np.empty(0, np.int32)
+_ROOT = np.zeros(1, np.int32)
+
+
+@dataclass(frozen=True)
+class Sets:
+    """What a message names, and from which state on."""
+
+    base: int
+    change: TableChange
+    sent: Int32
+    reactivated: Int32
+    removed: Int32
+    dropped: Int32
+    entry: Entry  # what to remember of it
+    events: Events | None = None  # says the same as the lists
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A message that may be sent, and the state it leads to; of a probe, the state it leaves."""
+
+    kind: MessageKind
+    message: bytes
+    portion: Portion
+    table: ManagementTable | None = None
+    sets: Sets | None = None
+    added: int = 0
+    coded: Encoded = NOTHING_CODED
+
+    @property
+    def payloads(self) -> int:
+        """Nodes sent."""
+        return self.coded.sent
+
+    @property
+    def payload_bytes(self) -> int:
+        """Of the nodes sent, before zstd."""
+        return len(self.coded.payload)
+
+
+@dataclass(frozen=True)
+class MessageWriter:
+    """Drafts of the one message that follows from a session's state and its newest search."""
+
+    session: int
+    sequence: int  # of the newest change sent
+    search_index: int
+    frame: int
+    tree: SearchTree
+    table: ManagementTable
+    journal: Journal
+    encoder: TreeEncoder
+
+    def probe(self, portion: Portion) -> Draft:
+        """Without a change; ``portion`` says what is pending."""
+        body = Probe(self.session, self.sequence).to_bytes()
+        return Draft("probe", seal(PROBE, body), portion)
+
+    def step(self, portion: Portion) -> Draft:
+        """What follows the message before."""
+        added, removed = self._changed(portion)
+        change = self.table.prepare_step(self.search_index, added, removed)
+        back = added[self.table.holds(added)]
+        entry = self._entry(change, np.concatenate([added, removed]), change.needed)
+        events = Events.of(self.encoder.tree, portion.expanded, portion.collapsed)
+        sets = Sets(self.sequence, change, change.needed, back, removed, _NOTHING, entry, events)
+        return self._written("step", self.table, sets, portion, len(added))
+
+    def repair(self, portion: Portion, names: tuple[Int32, Int32]) -> Draft:
+        """Sets every node that a message underway may have touched, whatever arrived of them:
+        ``names``, see `Journal.unacknowledged`.
+
+        A node that some message underway brought, or that is held no longer, is sent if it is in
+        the cut and dropped if it is not; the client surely holds all others.
+        """
+        added, removed = self._changed(portion)
+        named = np.unique(np.concatenate([names[0], added, removed]))
+        doubtful = np.isin(named, names[1]) | ~self.table.holds(named)
+        drawn = self.table.in_cut(named) & ~np.isin(named, removed) | np.isin(named, added)
+        left, dropped = named[~drawn & ~doubtful], named[~drawn & doubtful]
+        change = self.table.prepare(self.search_index, named[drawn], left, dropped)
+        sent, back = named[drawn & doubtful], named[drawn & ~doubtful]
+        entry = self._entry(change, named, named[doubtful])
+        sets = Sets(self.journal.applied, change, sent, back, left, dropped, entry)
+        return self._written("repair", self.table, sets, portion, len(added))
+
+    def start(self, portion: Portion) -> Draft:
+        """The client's whole cut, from nothing."""
+        cut = self._changed(portion)[0] if len(portion.expanded) else _ROOT
+        table = self.table.emptied()
+        change = table.prepare_step(self.search_index, cut, _NOTHING)
+        entry = Entry.start(self.sequence + 1, change.state_hash)
+        sets = Sets(0, change, cut, _NOTHING, _NOTHING, _NOTHING, entry)
+        return self._written("start", table, sets, portion, len(cut))
+
+    def _changed(self, portion: Portion) -> tuple[Int32, Int32]:
+        """Nodes that enter and leave the client's cut."""
+        tree, expanded, collapsed = self.tree, portion.expanded, portion.collapsed
+        return (
+            nodes_that_entered(tree, expanded, collapsed),
+            nodes_that_entered(tree, collapsed, expanded),
+        )
+
+    def _entry(self, change: TableChange, named: Int32, brought: Int32) -> Entry:
+        limit = self.journal.node_limit
+        return Entry.change(self.sequence + 1, change.state_hash, named, brought, limit)
+
+    def _written(
+        self, kind: MessageKind, table: ManagementTable, sets: Sets, portion: Portion, added: int
+    ) -> Draft:
+        if sets.events is None:
+            coded = self.encoder.encode(sets.sent)
+        else:
+            coded = self.encoder.encode_step(sets.events, sets.sent, table)
+        delta = DeltaCut(
+            session=self.session,
+            sequence=self.sequence + 1,
+            base=sets.base,
+            search_index=self.search_index,
+            frame=self.frame,
+            reactivated=_NOTHING if sets.events else sets.reactivated,
+            removed=_NOTHING if sets.events else sets.removed,
+            events=coded.events,
+            dropped=sets.dropped,
+            payload=coded.payload,
+            state_hash=sets.change.state_hash,
+            codec_hash=self.encoder.codec.version,
+        )
+        message = seal(DELTA_CUT, delta.to_bytes(self.encoder.child_numbers))
+        return Draft(kind, message, portion, table, sets, added, coded)
