@@ -320,6 +320,7 @@ WAITING = """
 import os, signal, sys, types, time
 from nebula.program import main
 from nebula.output import OutputDirectory
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by processes in the background
 module = types.ModuleType("nebula.area")
 def run(options):
     with OutputDirectory(sys.argv[1]) as out:

@@ -12,7 +12,7 @@ import pytest
 from gaussians.cameras import Display
 from gaussians.errors import InputError
 from lod_cloud.search import SEARCHES
-from nebula import build_tree, cli, search
+from nebula import build_tree, cli_options, search
 from nebula.options import (
     BuildTreeOptions,
     GeneratedCity,
@@ -36,7 +36,7 @@ def options(tmp_path_factory: pytest.TempPathFactory) -> SearchOptions:
 
 
 def test_the_names_are_those_of_the_searches() -> None:
-    assert tuple(cli.SEARCH_METHODS.choices) == search.METHODS
+    assert tuple(cli_options.SEARCH_METHODS.choices) == search.METHODS
 
 
 def test_all_methods_are_compared(options: SearchOptions) -> None:
