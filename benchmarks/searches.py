@@ -6,9 +6,9 @@
 Prints Markdown: per tree the walk at w = 4 by all methods on one thread, with ratios to the flat
 scan and to the Octree-GS rule; the walk at w = 1 and a recorded head by the wheel; teleports by
 `auto` and `streaming`; `streaming` on two threads; the wheel's growth from the first tree to the
-last. Then every number that has a target, PASSED or FAILED. Methods that take longer than a
-streamed search make 110 searches, of which 100 count, the others 460. Run it on a quiet machine:
-the load average stands in the first line.
+last, along the walk of the first. Then every number that has a target, PASSED or FAILED. Methods
+that take longer than a streamed search make 110 searches, of which 100 count, the others 460. Run
+it on a quiet machine: the load average stands in the first line.
 """
 
 from __future__ import annotations
@@ -180,7 +180,6 @@ class Report:
         self.rows: list[dict[str, Any]] = []
         self.verdicts: list[Verdict] = []
         self._tau_px, self._searches = tau_px, searches
-        self._wheel: dict[tuple[str, int], list[float]] = {}
 
     def tree(self, subject: Subject, heads: Sequence[str], intervals: Sequence[int]) -> None:
         """Everything about one tree."""
@@ -209,28 +208,44 @@ class Report:
         self._keep(subject, WALK, every, {"streaming": two})
         self.verdicts += lod_targets.two_thread_verdicts(place, two.row)
 
-    def growth(self, first: str, last: str) -> None:
-        """How the wheel grows from the first tree to the last."""
-        for (trace, every), times in self._wheel.items():
-            if trace == WALK and len(times) > 1:
-                verdict = lod_targets.growth_verdict(first, f"{last}, w = {every}", times)
-                self.verdicts.append(verdict)
+    def growth(self, first: Subject, last: Subject, intervals: Sequence[int]) -> None:
+        """How the wheel grows from a tree to a larger one that contains it, at the same views."""
+        for every in intervals:
+            requests = first.requests(WALK, every, self._tau_px, self._searches)
+            name = f"{WALK} of {first.name}"
+            times = []
+            for subject in (first, last):
+                found = self._compared(subject, name, requests, every, ["wheel"], False)
+                times.append(found["wheel"].row["cpu_p50_ms"])
+            self.verdicts.append(
+                lod_targets.growth_verdict(first.name, f"{last.name}, w = {every}", times)
+            )
 
     def _section(
         self, subject: Subject, trace: str, every: int, methods: Sequence[str], everything: bool
     ) -> dict[str, Measured]:
         requests = subject.requests(trace, every, self._tau_px, self._searches)
-        found = compare(subject, requests, every, [*methods, "wheel"])
+        name = Path(trace).stem
+        return self._compared(subject, name, requests, every, [*methods, "wheel"], everything)
+
+    def _compared(
+        self,
+        subject: Subject,
+        name: str,
+        requests: Sequence[SearchRequest],
+        every: int,
+        methods: Sequence[str],
+        everything: bool,
+    ) -> dict[str, Measured]:
+        found = compare(subject, requests, every, methods)
         if everything:
             found |= rules(subject, requests, every)
-        name = Path(trace).stem
         self.lines += [
             f"### {subject.name}, {name}, w = {every}, tau {self._tau_px:g} px, one thread",
             "",
             *table(subject, found),
         ]
         self._keep(subject, name, every, found)
-        self._wheel.setdefault((name, every), []).append(found["wheel"].row["cpu_p50_ms"])
         return found
 
     def _keep(self, subject: Subject, trace: str, every: int, found: dict[str, Measured]) -> None:
@@ -259,9 +274,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if not subjects:
         subjects = [generated(200_000)]
     report = Report(given.tau, DROPPED + given.searches)
+    intervals = given.every or [4, 1]
     for subject in subjects:
-        report.tree(subject, given.head, given.every or [4, 1])
-    report.growth(subjects[0].name, subjects[-1].name)
+        report.tree(subject, given.head, intervals)
+    if len(subjects) > 1:
+        report.growth(subjects[0], subjects[-1], intervals)
     print("\n".join([*report.lines, *(verdict.line() for verdict in report.verdicts)]))
     if given.json:
         verdicts = [verdict.as_row() for verdict in report.verdicts]

@@ -90,7 +90,7 @@ def generate_city(leaves: int, seed: int, sh_degree: int = 3) -> City:
     ]
     path = _path()
     target = np.array([path[0, 0] + 10.0, path[0, 1] + 0.5, EYE_HEIGHT_M + 0.1])
-    return City(assemble(rng, chunks, sh_degree), "+z", path[0], target, path)
+    return City(assemble(rng, chunks, sh_degree)[0], "+z", path[0], target, path)
 
 
 def walk_distance(points: Float64) -> Float64:

@@ -1,9 +1,11 @@
 """Cities of any size at one density, generated tile by tile in bounded memory.
 
-Towns of 160 m x 160 m (`layout`) stand side by side, each with houses of its own; their main
-streets join. Of this plane a square around the origin is filled so that it holds the wanted
-number of splats per square metre of ground. Unlike `city.generate_city`, density does not depend
-on where a walker goes: this is what level-of-detail searches are measured on.
+Towns of 160 m x 160 m (`layout`) stand side by side, each with houses of its own and with the same
+number of splats; their main streets join. A city is the splats of this endless plane that stand
+nearest to the origin, in squares around it: a larger city contains the smaller ones of the same
+density and seed, splat for splat, so that a view can be held fixed while the scene grows. Unlike
+`city.generate_city`, density does not depend on where a walker goes: this is what level-of-detail
+searches are measured on.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,11 +38,12 @@ from gaussians.synthetic.splats import (
 
 Float64 = NDArray[np.float64]
 Ids = NDArray[np.int64]
+Place = tuple[int, int]  # of a town, in units of its edge
 
 TOWN_M = 2 * HALF_EXTENT_M
 MIN_LEAVES, MAX_LEAVES = 1_000, 200_000_000
 _TILE_LEAVES = 400_000  # generated at a time
-_SORT_M = 10.0  # tiles are made of squares of this edge
+_BLOCK_M, _SORT_M = 40.0, 10.0  # tiles are made of squares, block by block
 _PATH_STEP_M = 1.0
 _PATH_MOST_M = 400.0
 _COARSEST = 40.0  # a size from the tail of the distribution, relative to the smallest
@@ -90,7 +94,7 @@ class TiledCity:
     @property
     def half_m(self) -> float:
         """Half the edge of the square of ground that is filled."""
-        return 0.5 * math.sqrt(self.leaves / DENSITIES[self.density].leaves_per_m2)
+        return self._filled.half_m
 
     @property
     def path(self) -> Float64:
@@ -107,86 +111,132 @@ class TiledCity:
 
     def tiles(self) -> Iterator[Scene]:
         """All splats, tile by tile: a few hundred thousand that stand together at a time."""
-        towns = self._towns()
-        weights = np.array([_overlap(*town, self.half_m) for town in towns])
-        counts = systematic_counts(weights, self.leaves, 0.5)
-        for town, count in zip(towns, counts, strict=True):
-            if count:
-                yield from _town_tiles(self, town, int(count))
+        for place, taken in self._filled.towns:
+            if taken.any():
+                yield from _town_tiles(self, place, taken)
 
-    def _towns(self) -> list[tuple[int, int]]:
-        """Positions of the towns the square meets, in units of their edge, row by row."""
-        reach = math.ceil(max(0.0, self.half_m / TOWN_M - 0.5))
-        span = range(-reach, reach + 1)
-        return [(x, y) for y in span for x in span]
+    @cached_property
+    def _filled(self) -> _Filled:
+        half_m = 0.5 * math.sqrt(self.leaves / DENSITIES[self.density].leaves_per_m2)  # about
+        reach = math.ceil(max(0.0, half_m / TOWN_M - 0.5))
+        while (filled := _fill(self, reach)) is None:
+            reach += 1
+        return filled
 
 
-def _overlap(x: int, y: int, half_m: float) -> float:
-    """Square metres of a town inside the square."""
-    edges = []
-    for at in (x, y):
-        low, high = (at - 0.5) * TOWN_M, (at + 0.5) * TOWN_M
-        edges.append(max(0.0, min(high, half_m) - max(low, -half_m)))
-    return edges[0] * edges[1]
+@dataclass(frozen=True)
+class _Filled:
+    """Which splats of the plane belong to a city."""
+
+    half_m: float
+    towns: list[tuple[Place, Ids]]  # how many splats of every cell
+
+
+def _fill(city: TiledCity, reach: int) -> _Filled | None:
+    """The cells nearest to the origin among towns up to ``reach`` away; None if these are too few.
+
+    Cells equally far away follow each other by town and number, whatever the reach is.
+    """
+    span = range(-reach, reach + 1)
+    places = [(x, y) for y in span for x in span]
+    towns = [_Town.of(city, place) for place in places]
+    distance = np.concatenate([town.cells.off_centre for town in towns])
+    counts = np.concatenate([town.counts for town in towns])
+    order = np.argsort(distance, kind="stable")
+    total = np.cumsum(counts[order])
+    last = int(np.searchsorted(total, city.leaves))
+    if last == len(order) or distance[order[last]] > (reach + 0.5) * TOWN_M:
+        return None
+    taken = np.zeros_like(counts)
+    taken[order[:last]] = counts[order[:last]]
+    taken[order[last]] = city.leaves - (total[last] - counts[order[last]])
+    edges = np.cumsum([len(town.counts) for town in towns])[:-1]
+    half_m = float(distance[order[last]])
+    return _Filled(half_m, list(zip(places, np.split(taken, edges), strict=True)))
 
 
 @dataclass(frozen=True)
 class _Cells:
-    """Pieces of rectangles and whole crowns of one town, those inside the square."""
+    """Pieces of rectangles and whole crowns of one town."""
 
     patch: Ids  # [C] rectangle, or -1 - crown
     corners: Float64  # [C, 2] metres on the rectangle
     sizes: Float64  # [C, 2]
     areas: Float64  # [C] square metres to cover
     weights: Float64  # [C]
+    off_centre: Float64  # [C] metres from the origin along x or y, whichever is more
 
     def take(self, rows: Ids) -> _Cells:
         return _Cells(*(getattr(self, f)[rows] for f in self.__dataclass_fields__))
 
 
-def _town_tiles(city: TiledCity, town: tuple[int, int], count: int) -> Iterator[Scene]:
-    rng = _generator(city.seed, town, 0)
-    geometry = _moved(open_town(rng), town)
-    density = DENSITIES[city.density]
-    cells = _cells(geometry, density.cell_m, city.half_m)
-    counts = systematic_counts(cells.weights, count, float(rng.random()))
-    edges = np.searchsorted(np.cumsum(counts), np.arange(0, count, _TILE_LEAVES), side="right")
-    bounds = np.unique(np.append(edges, len(counts)))
-    pieces = len(bounds) - 1
-    scenes: list[Scene | None] = [None] * pieces
+@dataclass(frozen=True)
+class _Town:
+    """The same whatever city it belongs to."""
+
+    geometry: Geometry
+    cells: _Cells
+    counts: Ids  # [C] splats
+
+    @classmethod
+    def of(cls, city: TiledCity, place: Place) -> _Town:
+        rng = _generator(city.seed, place, 0)
+        geometry = _moved(open_town(rng), place)
+        density = DENSITIES[city.density]
+        cells = _cells(geometry, density.cell_m)
+        total = round(density.leaves_per_m2 * TOWN_M * TOWN_M)
+        return cls(geometry, cells, systematic_counts(cells.weights, total, float(rng.random())))
+
+
+def _town_tiles(city: TiledCity, place: Place, taken: Ids) -> Iterator[Scene]:
+    """Of every cell the first ``taken`` [C] splats. Tiles are made whole and then cut."""
+    town = _Town.of(city, place)
+    total = int(town.counts.sum())
+    edges = np.searchsorted(np.cumsum(town.counts), np.arange(0, total, _TILE_LEAVES), side="right")
+    bounds = np.unique(np.append(edges, len(town.counts)))
+    wanted = [piece for piece, n in enumerate(np.add.reduceat(taken, bounds[:-1])) if n]
+    scenes: list[Scene | None] = [None] * len(wanted)
 
     def generate(begin: int, end: int) -> None:
-        for piece in range(begin, end):
-            rows = np.arange(bounds[piece], bounds[piece + 1])
-            own = _generator(city.seed, town, 1 + piece)
-            chunks = _sample(own, geometry, cells.take(rows), counts[rows], density)
-            scenes[piece] = assemble(own, chunks, city.sh_degree)
+        for i in range(begin, end):
+            rows = np.arange(bounds[wanted[i]], bounds[wanted[i] + 1])
+            scenes[i] = _tile(city, place, 1 + wanted[i], town, rows, taken[rows])
 
-    for first in range(0, pieces, 16):  # as many at a time as keep all threads busy
-        last = min(first + 16, pieces)
+    for first in range(0, len(wanted), 16):  # as many at a time as keep all threads busy
+        last = min(first + 16, len(wanted))
         run_chunks(lambda b, e, first=first: generate(first + b, first + e), last - first)
-        for piece in range(first, last):
-            scene, scenes[piece] = scenes[piece], None
-            if scene is not None and len(scene):
+        for i in range(first, last):
+            scene, scenes[i] = scenes[i], None
+            if scene is not None:
                 yield scene
 
 
-def _generator(seed: int, town: tuple[int, int], piece: int) -> np.random.Generator:
+def _tile(city: TiledCity, place: Place, stream: int, town: _Town, rows: Ids, taken: Ids) -> Scene:
+    rng = _generator(city.seed, place, stream)
+    counts = town.counts[rows]
+    chunks, places = _sample(
+        rng, town.geometry, town.cells.take(rows), counts, DENSITIES[city.density]
+    )
+    scene, order = assemble(rng, chunks, city.sh_degree)
+    number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    kept = (number < np.repeat(taken, counts))[places]
+    return scene if kept.all() else scene.take(np.flatnonzero(kept[order]))
+
+
+def _generator(seed: int, town: Place, piece: int) -> np.random.Generator:
     """Independent of all others; entropy must not be negative."""
     key = [seed, *(2 * abs(v) + (v < 0) for v in town), piece]
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(key)))
 
 
-def _moved(geometry: Geometry, town: tuple[int, int]) -> Geometry:
+def _moved(geometry: Geometry, town: Place) -> Geometry:
     shift = TOWN_M * np.array([town[0], town[1], 0.0])
     patches = replace(geometry.patches, origins=geometry.patches.origins + shift)
     return Geometry(patches, replace(geometry.crowns, centres=geometry.crowns.centres + shift))
 
 
-def _cells(geometry: Geometry, most_m: float, half_m: float) -> _Cells:
-    """Rectangles cut evenly into cells, and crowns, whose centres lie in the square; neighbours
-    on the ground follow each other.
-    """
+def _cells(geometry: Geometry, most_m: float) -> _Cells:
+    """Rectangles cut evenly into cells, and crowns; neighbours on the ground follow each other."""
     patches, crowns = geometry.patches, geometry.crowns
     pieces = np.maximum(np.ceil(patches.lengths / most_m).astype(np.int64), 1)
     number = pieces.prod(axis=1)
@@ -205,12 +255,10 @@ def _cells(geometry: Geometry, most_m: float, half_m: float) -> _Cells:
         np.concatenate([sizes, nothing]),
         np.concatenate([area, leafy]),
         np.concatenate([area * value[patch], leafy * crowns.exposures]),
+        np.abs(centres[:, :2]).max(axis=1),
     )
-    off_centre = np.abs(centres[:, :2]).max(axis=1)
-    inside = off_centre <= max(half_m, float(off_centre.min()))  # one cell at least
-    squares = np.floor(centres[:, :2] / _SORT_M).astype(np.int64)
-    order = np.lexsort([squares[:, 1], squares[:, 0]])
-    return cells.take(order[inside[order]])
+    keys = [np.floor(centres[:, axis] / edge) for edge in (_SORT_M, _BLOCK_M) for axis in (1, 0)]
+    return cells.take(np.lexsort(keys))
 
 
 def _sample(
@@ -219,8 +267,10 @@ def _sample(
     cells: _Cells,
     counts: Ids,
     density: CityDensity,
-) -> list[Chunk]:
-    """Splats spread evenly over their cells: some that cover it, smaller ones of all sizes."""
+) -> tuple[list[Chunk], Ids]:
+    """Splats spread evenly over their cells: some that cover it, smaller ones of all sizes; and
+    which of all splats, cell by cell, stand in which place of the chunks.
+    """
     cell = np.repeat(np.arange(len(counts)), counts)
     apart = np.sqrt(cells.areas / np.maximum(counts, 1))[cell]
     covering = rng.random(len(cell)) < OPAQUE_SHARE
@@ -242,7 +292,8 @@ def _sample(
         _PLAIN,
     )
     ids = -1 - cells.patch[cell[grown]]
-    return [surface, _leaves(rng, geometry.crowns, ids, spread[grown], opacities[grown])]
+    crowns = _leaves(rng, geometry.crowns, ids, spread[grown], opacities[grown])
+    return [surface, crowns], np.concatenate([flat, grown])
 
 
 def _leaves(

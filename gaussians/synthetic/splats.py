@@ -131,8 +131,10 @@ def blobs(
     return Chunk(means, unit_vectors(rng, count, 4), scales, opacities, colours, lobes)
 
 
-def assemble(rng: np.random.Generator, chunks: list[Chunk], sh_degree: int) -> Scene:
-    """All chunks in random order (trained files are in no order either), with harmonics."""
+def assemble(rng: np.random.Generator, chunks: list[Chunk], sh_degree: int) -> tuple[Scene, Ids]:
+    """All chunks in random order (trained files are in no order either), with harmonics; and that
+    order.
+    """
     if sh_degree not in (0, 1, 2, 3):
         raise InputError(f"sh_degree must be 0, 1, 2 or 3, not {sh_degree}")
     count = sum(len(c.means) for c in chunks)
@@ -143,7 +145,7 @@ def assemble(rng: np.random.Generator, chunks: list[Chunk], sh_degree: int) -> S
     )
     lobes = np.concatenate([c.lobes for c in chunks])[order]
     sh = _harmonics(rng, colours, lobes, sh_degree)
-    return Scene(means, quaternions, scales, opacities, sh).validate("synthetic scene")
+    return Scene(means, quaternions, scales, opacities, sh).validate("synthetic scene"), order
 
 
 def _harmonics(

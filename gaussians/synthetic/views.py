@@ -116,7 +116,7 @@ def benchmark_scene(view: BenchmarkView) -> tuple[Scene, StereoRig]:
     hits = hits.take(np.sort(rng.permutation(len(hits.depths))[:wanted]))
     solid = _solid(rng, geometry, pose, grid, hits, view)
     free = _floaters(rng, pose, (half_width, half_height), floaters, d.fx)
-    return assemble(rng, [*solid, free], view.sh_degree), rig
+    return assemble(rng, [*solid, free], view.sh_degree)[0], rig
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,8 @@ def tree_of(city: TiledCity) -> LodTree:
             "dense",
             600_000,  # a piece of street without its houses: at full size there is 2.5 times more
             {
-                "leaves_per_m2": (300, 400),
-                "sigma_m": (0.045, 0.058),
+                "leaves_per_m2": (520, 640),
+                "sigma_m": (0.030, 0.040),
                 "large_leaf_share": (0.33, 0.40),
                 "added_per_m": (7_000, 14_000),
             },
