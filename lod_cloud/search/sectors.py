@@ -98,6 +98,5 @@ def sector_of(x, y, z):  # type: ignore[no-untyped-def]
 @njit
 def reach(axis_cosine, cosine, sine):  # type: ignore[no-untyped-def]
     """Support function of a cap: from the cosine between its axis and a unit vector."""
-    if axis_cosine >= cosine:
-        return 1.0
-    return axis_cosine * cosine + np.sqrt(max(0.0, 1.0 - axis_cosine * axis_cosine)) * sine
+    beside = axis_cosine * cosine + np.sqrt(max(0.0, 1.0 - axis_cosine * axis_cosine)) * sine
+    return 1.0 if axis_cosine >= cosine else beside

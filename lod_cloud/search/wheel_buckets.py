@@ -40,8 +40,8 @@ HANDS = 2 * SECTORS + 1  # hand 2 j + kind belongs to sector j; the last one mov
 FINE_M, FINE = 2.0**-7, 8  # width and number of fine buckets of a hand: one coarse bucket
 COARSE_M, COARSE = 2.0**-4, 512
 FINE_BITS = 3  # FINE = 2^3
-RING = FINE + COARSE
-BUCKETS = HANDS * RING + 1  # the last one is popped at every search
+COARSE_BEGIN = HANDS * FINE  # fine buckets stand together: they fit into the nearest cache
+BUCKETS = HANDS * (FINE + COARSE) + 1  # the last one is popped at every search
 PER_CHUNK = 15  # node ids in a chunk of 64 bytes; its first number is the next chunk
 FREE, USED = 0, 1  # places in ``counts``: first free chunk, chunks ever used
 _SLACK = np.float32(2.0**-21)
@@ -49,6 +49,7 @@ _TINY = np.float32(1e-15)  # metres; squares of less may vanish in float32
 _ZERO, _LITTLE, _LEAST = np.float32(0), np.float32(1e-3), np.float32(1e-30)
 _MU, _GAIN = np.float32(MU), np.float32(KAPPA - MU)
 _NEAR = 12  # nodes whose chunk is asked for in advance
+_HANDS_AHEAD = 12  # likewise hands, whose coarse bucket is
 
 
 @njit(forceinline=True)
@@ -87,31 +88,51 @@ def _bucket(margin, way, sector, hands, rates):  # type: ignore[no-untyped-def]
     key = now - abs(now) * 1e-15 + min(far * ((1.0 - 1e-6) / FINE_M), 2.0 * COARSE * FINE)
     here, fine = np.int64(np.floor(now)), np.int64(np.floor(key))
     coarse = min(fine >> FINE_BITS, (here >> FINE_BITS) + COARSE - 1)
-    place = fine & (FINE - 1) if fine - here < FINE else FINE + (coarse & (COARSE - 1))
-    return hand * RING + place if margin > 0 and key > now else BUCKETS - 1
+    nearby = hand * FINE + (fine & (FINE - 1))
+    distant = COARSE_BEGIN + hand * COARSE + (coarse & (COARSE - 1))
+    place = nearby if fine - here < FINE else distant
+    return place if margin > 0 and key > now else BUCKETS - 1
 
 
 @njit
-def _set_rates(step, length, rates, axes, cosines, sines):  # type: ignore[no-untyped-def]
-    """How far every hand advances per metre of a step."""
-    rates[HANDS - 1] = 1.0
+def _advance(step, hands, rates, axes, cosines, sines, spans):  # type: ignore[no-untyped-def]
+    """Move all hands by a step, and note for each the fine and the coarse buckets it passed: the
+    first one's number and how many they are, in columns of ``spans`` [HANDS, 4].
+    """
+    length = np.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
+    if length == 0.0:
+        spans[:] = 0
+        return
+    rates[HANDS - 1] = 1.0  # metres per metre of the step
     for j in range(SECTORS):
         along = axes[j, 0] * step[0] + axes[j, 1] * step[1] + axes[j, 2] * step[2]
         advance = reach(along / length, cosines[j], sines[j])
         rates[2 * j] = advance
         rates[2 * j + 1] = max(advance + KAPPA, MU)
+    for hand in range(HANDS):
+        before = hands[hand]
+        now = before + (rates[hand] + 1e-12) * length
+        now += (abs(now) + abs(before)) * 2.3e-16
+        hands[hand] = now
+        fine, coarse = np.floor(before * (1.0 / FINE_M)), np.floor(before * (1.0 / COARSE_M)) + 1.0
+        passed = np.float64(now > before)
+        spans[hand, 0] = fine
+        spans[hand, 1] = passed * min(np.floor(now * (1.0 / FINE_M)) - fine + 1.0, FINE)
+        spans[hand, 2] = coarse
+        spans[hand, 3] = passed * min(np.floor(now * (1.0 / COARSE_M)) - coarse + 1.0, COARSE)
 
 
 @njit(forceinline=True)
 def _take(bucket, heads, chunks, taken, count):  # type: ignore[no-untyped-def]
-    """Empty a bucket and note its first chunk; the number of those noted."""
+    """Empty a bucket and note its first chunk; the number of those noted.
+
+    Without branches: whether there is something in it nobody could predict.
+    """
     head = heads[bucket]
-    if head >= 0:
-        prefetch(chunks, np.intp(head >> 4) * (PER_CHUNK + 1))
-        taken[count] = head
-        heads[bucket] = -1
-        count += 1
-    return count
+    heads[bucket] = -1
+    taken[count] = head
+    prefetch(chunks, np.intp(max(head, 0) >> 4) * (PER_CHUNK + 1))
+    return count + np.intp(head >= 0)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -120,32 +141,23 @@ def collect(step, hands, rates, heads, counts, chunks, axes, cosines, sines):  #
 
     Their entries are gone, their ``scheduled`` marks stay.
     """
-    taken = np.empty(1024, np.int32)
+    if len(chunks) == 0:
+        return np.empty(0, np.int32)
+    spans = np.empty((HANDS, 4), np.int32)
+    _advance(step, hands, rates, axes, cosines, sines, spans)
+    taken = np.empty(4096, np.int32)
     count = _take(BUCKETS - 1, heads, chunks, taken, 0)
-    length = np.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
-    if length > 0.0:
-        _set_rates(step, length, rates, axes, cosines, sines)
-    for hand in range(HANDS if length > 0.0 else 0):
-        before = hands[hand]
-        now = before + (rates[hand] + 1e-12) * length
-        now += (abs(now) + abs(before)) * 2.3e-16
-        hands[hand] = now
-        if now <= before:
-            continue
-        if hand + 4 < HANDS:
-            later = np.intp(np.floor(hands[hand + 4] * (1.0 / FINE_M)))
-            prefetch(heads, (hand + 4) * RING + (later & (FINE - 1)))
-        first = np.intp(np.floor(before * (1.0 / FINE_M)))
-        last = min(np.intp(np.floor(now * (1.0 / FINE_M))), first + FINE - 1)
-        from_coarse = np.intp(np.floor(before * (1.0 / COARSE_M))) + 1
-        to_coarse = min(np.intp(np.floor(now * (1.0 / COARSE_M))), from_coarse + COARSE - 1)
+    for hand in range(HANDS):
+        later = min(hand + _HANDS_AHEAD, HANDS - 1)
+        ahead = np.intp(spans[later, 2]) & (COARSE - 1)
+        prefetch(heads, COARSE_BEGIN + later * COARSE + ahead)
         if count + FINE + COARSE > len(taken):
             taken = longer(taken, FINE + COARSE)
-        for fine in range(first, last + 1):
-            bucket = hand * RING + (fine & (FINE - 1))
+        for fine in range(spans[hand, 0], spans[hand, 0] + spans[hand, 1]):
+            bucket = hand * FINE + (fine & (FINE - 1))
             count = _take(bucket, heads, chunks, taken, count)
-        for coarse in range(from_coarse, to_coarse + 1):
-            bucket = hand * RING + FINE + (coarse & (COARSE - 1))
+        for coarse in range(spans[hand, 2], spans[hand, 2] + spans[hand, 3]):
+            bucket = COARSE_BEGIN + hand * COARSE + (coarse & (COARSE - 1))
             count = _take(bucket, heads, chunks, taken, count)
     return _release(counts, chunks, taken[:count])
 
