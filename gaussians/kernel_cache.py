@@ -20,6 +20,7 @@ SHARED_SOURCES = (
     "lod_cloud/search/marks.py",
     "lod_cloud/search/prefetching.py",
     "lod_cloud/search/sectors.py",
+    "lod_cloud/search/wheel_buckets.py",
     "lod_cloud/search_arrays.py",
 )
 

@@ -55,6 +55,7 @@ FLOAT64 = {
     "lod_cloud.search.treelets._test_below": "keeps those margins; decisions are float32",
     "lod_cloud.search.treelets.search_treelets": "same",
     "lod_cloud.search.wheel_buckets": "when an entry is due, by a stated bound",
+    "lod_cloud.search.wheel_decisions.settle": "makes those entries; decisions are float32",
 }
 # Of these, where float32 matters beside float64: the float64 variables by name.
 NAMES = {
@@ -62,6 +63,7 @@ NAMES = {
     "lod_cloud.pacing_kernels.expand_first": {"cx", "cy", "cz", "limit_nodes"},
     "lod_cloud.search.treelets._test_below": {"least"},
     "lod_cloud.search.treelets.search_treelets": {"balls", "holds", "least"},
+    "lod_cloud.search.wheel_decisions.settle": {"hands", "rates"},
     "lod_cloud.criterion._count_violations": {
         *("ax", "ay", "az", "sx", "sy", "sz", "length", "away", "cameras"),
     },

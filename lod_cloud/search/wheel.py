@@ -45,10 +45,9 @@ class WheelSearch(Search):
         self._hands = np.zeros(wheel.HANDS)
         self._rates = np.full(wheel.HANDS, _UNKNOWN_RATE)  # of the hands, per metre of path
         self._heads = np.full(wheel.BUCKETS, -1, np.int32)
-        self._counts = np.array([-1, 0], np.int32)
+        self._counts = np.array([-1, 0, 0], np.int32)
         self._chunks = np.empty((0, wheel.PER_CHUNK + 1), np.int32)
         self._scheduled = tree.new_marks()  # nodes that have an entry
-        self._entries = 0
         # room for the worst case; memory is taken by what is written
         self._lists = np.empty((3, len(tree)), np.int32)
         self._queue = np.empty(2 * len(tree), np.int32)
@@ -81,9 +80,8 @@ class WheelSearch(Search):
     def _clear(self) -> None:
         self._hands[:] = 0.0
         self._heads[:] = -1
-        self._counts[:] = -1, 0
+        self._counts[:] = -1, 0, 0
         self._scheduled[:] = 0
-        self._entries = 0
 
     def _collect(self, request: SearchRequest) -> Int32:
         """Move the hands to the new camera; nodes whose entries are due."""
@@ -98,7 +96,6 @@ class WheelSearch(Search):
             self._chunks,
             *self._sectors,
         )
-        self._entries -= len(due)
         return due
 
     def _settle(self, due: Int32, budget: int) -> tuple[Int32, Int32, int]:
@@ -120,6 +117,11 @@ class WheelSearch(Search):
             budget,
             self._lists,
             self._numbers,
+            self._hands,
+            self._rates,
+            self._heads,
+            self._counts,
+            self._chunks,
         )
         opened, closed, waiting = (
             row[:count] for row, count in zip(self._lists, self._numbers, strict=True)
@@ -138,9 +140,7 @@ class WheelSearch(Search):
         return int(at)
 
     def _insert(self, nodes: Int32) -> None:
-        self._entries += len(nodes)
-        # one chunk of a bucket is not full
-        needed = min(wheel.BUCKETS, self._entries) + self._entries // wheel.PER_CHUNK
+        needed = wheel.chunks_for(self._counts[wheel.ENTRIES] + len(nodes))
         if needed > len(self._chunks):
             larger = np.empty((needed + needed // 4, wheel.PER_CHUNK + 1), np.int32)
             larger[: len(self._chunks)] = self._chunks

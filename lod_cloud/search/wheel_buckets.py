@@ -43,7 +43,7 @@ FINE_BITS = 3  # FINE = 2^3
 COARSE_BEGIN = HANDS * FINE  # fine buckets stand together: they fit into the nearest cache
 BUCKETS = HANDS * (FINE + COARSE) + 1  # the last one is popped at every search
 PER_CHUNK = 15  # node ids in a chunk of 64 bytes; its first number is the next chunk
-FREE, USED = 0, 1  # places in ``counts``: first free chunk, chunks ever used
+FREE, USED, ENTRIES = 0, 1, 2  # in ``counts``: first free chunk, chunks ever used, entries
 _SLACK = np.float32(2.0**-21)
 _TINY = np.float32(1e-15)  # metres; squares of less may vanish in float32
 _ZERO, _LITTLE, _LEAST = np.float32(0), np.float32(1e-3), np.float32(1e-30)
@@ -52,8 +52,14 @@ _NEAR = 12  # nodes whose chunk is asked for in advance
 _HANDS_AHEAD = 12  # likewise hands, whose coarse bucket is
 
 
+@njit(cache=True)
+def chunks_for(entries):  # type: ignore[no-untyped-def]
+    """Chunks that hold so many entries, wherever they are: one of a bucket is not full."""
+    return min(BUCKETS, entries) + entries // PER_CHUNK
+
+
 @njit(forceinline=True)
-def _keys(held, cx, cy, cz, k, grow, rows, was, margins, ways, sectors):  # type: ignore[no-untyped-def]
+def find_keys(held, cx, cy, cz, k, grow, rows, was, margins, ways, sectors):  # type: ignore[no-untyped-def]
     """For a batch of nodes: how far to go before the decision can change, in any direction
     (``margins``) and by the hand of a sector (``ways``), and which hand that is.
 
@@ -159,7 +165,9 @@ def collect(step, hands, rates, heads, counts, chunks, axes, cosines, sines):  #
         for coarse in range(spans[hand, 2], spans[hand, 2] + spans[hand, 3]):
             bucket = COARSE_BEGIN + hand * COARSE + (coarse & (COARSE - 1))
             count = _take(bucket, heads, chunks, taken, count)
-    return _release(counts, chunks, taken[:count])
+    due = _release(counts, chunks, taken[:count])
+    counts[ENTRIES] -= len(due)
+    return due
 
 
 @njit
@@ -183,38 +191,47 @@ def _release(counts, chunks, taken):  # type: ignore[no-untyped-def]
     return due[:found]
 
 
+@njit(forceinline=True)
+def put(nodes, keys, buckets, hands, rates, heads, counts, chunks):  # type: ignore[no-untyped-def]
+    """Make an entry for each node of a batch, by its keys (margin, way, sector). There must be
+    chunks enough for all. ``buckets`` is for its own use.
+
+    The buckets of all are found first, so that they can be asked for.
+    """
+    margins, ways, sectors = keys
+    for i in range(len(nodes)):
+        bucket = _bucket(margins[i], ways[i], sectors[i], hands, rates)
+        buckets[i] = bucket
+        prefetch(heads, bucket)
+    for i in range(len(nodes)):
+        if i + _NEAR < len(nodes):
+            later = max(heads[buckets[i + _NEAR]], 0) >> 4
+            prefetch(chunks, np.intp(later) * (PER_CHUNK + 1))
+        head = heads[buckets[i]]
+        if head < 0 or head & 15 == PER_CHUNK:
+            fresh = counts[FREE]
+            if fresh >= 0:
+                counts[FREE] = chunks[fresh, 0]
+            else:
+                fresh = counts[USED]
+                counts[USED] += 1
+            chunks[fresh, 0] = head >> 4
+            head = fresh << 4
+        head += 1
+        chunks[head >> 4, head & 15] = nodes[i]
+        heads[buckets[i]] = head
+    counts[ENTRIES] += len(nodes)
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
 def insert(nodes, cx, cy, cz, k, grow, floats, refined, hands, rates, heads, counts, chunks):  # type: ignore[no-untyped-def]
-    """Make an entry for each node, whose decision is known. There must be chunks enough for all.
-
-    In batches: the buckets of all of a batch are found first, so that they can be asked for.
-    """
+    """Make an entry for each node, whose decision is known. There must be chunks enough for all."""
     rows = np.zeros((5, BATCH), np.float32)
     was = np.zeros(BATCH, np.bool_)
     margins, ways = np.empty(BATCH, np.float32), np.empty(BATCH, np.float32)
-    sectors = np.empty(BATCH, np.int32)
-    buckets = np.empty(BATCH, np.intp)
+    sectors, buckets = np.empty(BATCH, np.int32), np.empty(BATCH, np.intp)
     for begin in range(0, len(nodes), BATCH):
         held = gather(nodes, begin, len(nodes), floats, refined, rows, was)
-        _keys(held, cx, cy, cz, k, grow, rows, was, margins, ways, sectors)
-        for i in range(held):
-            bucket = _bucket(margins[i], ways[i], sectors[i], hands, rates)
-            buckets[i] = bucket
-            prefetch(heads, bucket)
-        for i in range(held):
-            if i + _NEAR < held:
-                later = max(heads[buckets[i + _NEAR]], 0) >> 4
-                prefetch(chunks, np.intp(later) * (PER_CHUNK + 1))
-            head = heads[buckets[i]]
-            if head < 0 or head & 15 == PER_CHUNK:
-                fresh = counts[FREE]
-                if fresh >= 0:
-                    counts[FREE] = chunks[fresh, 0]
-                else:
-                    fresh = counts[USED]
-                    counts[USED] += 1
-                chunks[fresh, 0] = head >> 4
-                head = fresh << 4
-            head += 1
-            chunks[head >> 4, head & 15] = nodes[begin + i]
-            heads[buckets[i]] = head
+        find_keys(held, cx, cy, cz, k, grow, rows, was, margins, ways, sectors)
+        batch = nodes[begin : begin + held]
+        put(batch, (margins, ways, sectors), buckets, hands, rates, heads, counts, chunks)

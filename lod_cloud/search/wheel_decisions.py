@@ -12,6 +12,7 @@ from numba import njit
 
 from lod_cloud.search.marks import any_set, clear_bit, is_set, longer, set_bit, stays_refined
 from lod_cloud.search.prefetching import BATCH, gather, prefetch
+from lod_cloud.search.wheel_buckets import ENTRIES, chunks_for, find_keys, put
 from lod_cloud.search_arrays import CHILD_COUNT, FIRST_CHILD, PARENT, RECORD_COLUMNS
 
 OPENED, CLOSED, WAITING = 0, 1, 2  # rows of ``lists``
@@ -46,21 +47,25 @@ def _compare(held, cx, cy, cz, k, grow, rows, was, changed):  # type: ignore[no-
 
 
 @njit(forceinline=True)
-def _sift(nodes, was, changed, ints, refined, special, waiting):  # type: ignore[no-untyped-def]
-    """Move the nodes of a batch to ``waiting``, but for those that change or are not active; the
-    places of these in the batch go to ``special``. How many there are of the latter.
+def _sift(nodes, was, changed, ints, refined, others, places, keys):  # type: ignore[no-untyped-def]
+    """Move the nodes of a batch that stay as they are, and their keys, to its front; those that
+    change or are not active to ``others``, and where in the batch they stood to ``places``. How
+    many there are of the latter.
     """
+    margins, ways, sectors = keys
     for i in range(len(nodes)):
         node = nodes[i]
         near = ints[node, FIRST_CHILD] if was[i] else max(ints[node, PARENT], _ROOT)
         prefetch(refined, np.intp(near >> 3))
     stayed = found = 0
     for i in range(len(nodes)):
-        stays = _is_active(nodes[i], was[i], ints, refined) & (not changed[i])
-        waiting[stayed] = nodes[i]
-        stayed += np.int64(stays)
-        special[found] = i
+        node = nodes[i]
+        stays = _is_active(node, was[i], ints, refined) & (not changed[i])
+        others[found], places[found] = node, i
         found += np.int64(not stays)
+        nodes[stayed], margins[stayed] = node, margins[i]
+        ways[stayed], sectors[stayed] = ways[i], sectors[i]
+        stayed += np.int64(stays)
     return found
 
 
@@ -112,39 +117,48 @@ def _expand(node, ints, refined, scheduled, lists, counts, queue, tail):  # type
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def settle(  # type: ignore[no-untyped-def]
-    queue, due, cx, cy, cz, k, grow, floats, ints, refined, scheduled, budget, lists, counts
-):
+    queue, due, cx, cy, cz, k, grow, floats, ints, refined, scheduled, budget, lists, events,
+    hands, rates, heads, counts, chunks,
+):  # fmt: skip
     """Test the first ``due`` nodes of a queue and everything that follows from those that change.
 
-    Writes expanded, collapsed (in no order) and nodes to insert to ``lists`` [3, nodes], their
-    numbers to ``counts``; returns the number of nodes tested. Stops, with nothing in order but the
-    two lists of events, once more than ``budget`` nodes have been tested.
+    Nodes that stay as they are get new entries as long as there are chunks. Writes expanded,
+    collapsed (in no order) and other nodes to insert to ``lists`` [3, nodes], their numbers to
+    ``events``; returns the number of nodes tested. Stops, with nothing in order but the two lists
+    of events, once more than ``budget`` nodes have been tested.
 
     In batches. Nobody else changes the decision of a node that is due, so all of a batch are
     tested at once; whether they are active may change while others of the batch are looked at.
     What becomes due is put at the end of the queue, which has room for 2 N: no node twice, but
-    for those that were due before and not active.
+    for those that were due before and not active. The queue behind its head is overwritten.
     """
     rows = np.zeros((5, BATCH), np.float32)
     was, changed = np.zeros(BATCH, np.bool_), np.zeros(BATCH, np.bool_)
-    special = np.empty(BATCH, np.intp)
+    others, places = np.empty(BATCH, np.int32), np.empty(BATCH, np.intp)
+    margins, ways = np.empty(BATCH, np.float32), np.empty(BATCH, np.float32)
+    sectors, buckets = np.empty(BATCH, np.int32), np.empty(BATCH, np.intp)
+    keys = margins, ways, sectors
     head, tail = 0, due
-    counts[:] = 0
+    events[:] = 0
     tested = 0
     while head < tail and tested <= budget:
         held = gather(queue, head, tail, floats, refined, rows, was)
         batch = queue[head : head + held]
         head += held
         _compare(held, cx, cy, cz, k, grow, rows, was, changed)
-        found = _sift(
-            batch, was, changed, ints, refined, special, lists[WAITING, counts[WAITING] :]
-        )
-        counts[WAITING] += held - found
-        tested += held - found
+        find_keys(held, cx, cy, cz, k, grow, rows, was, margins, ways, sectors)
+        found = _sift(batch, was, changed, ints, refined, others, places, keys)
+        stay = batch[: held - found]
+        tested += len(stay)
+        if chunks_for(counts[ENTRIES] + held) <= len(chunks):
+            put(stay, keys, buckets, hands, rates, heads, counts, chunks)
+        else:
+            lists[WAITING, events[WAITING] : events[WAITING] + len(stay)] = stay
+            events[WAITING] += len(stay)
         for i in range(found):
-            place, later = special[i], special[min(i + _NEAR, found - 1)]
-            _ask_for_neighbours(batch[later], was[later], ints, scheduled)
-            node = batch[place]
+            place, later = places[i], min(i + _NEAR, found - 1)
+            _ask_for_neighbours(others[later], was[places[later]], ints, scheduled)
+            node = others[i]
             if not _is_active(node, was[place], ints, refined):
                 clear_bit(scheduled, node)
                 continue
@@ -152,15 +166,15 @@ def settle(  # type: ignore[no-untyped-def]
             if tested > budget:
                 break
             if not changed[place]:
-                _append(node, WAITING, lists, counts)
+                _append(node, WAITING, lists, events)
             elif was[place]:
-                tail = _collapse(node, ints, refined, scheduled, lists, counts, queue, tail)
+                tail = _collapse(node, ints, refined, scheduled, lists, events, queue, tail)
             else:
-                tail = _expand(node, ints, refined, scheduled, lists, counts, queue, tail)
-    for node in lists[OPENED, : counts[OPENED]]:
+                tail = _expand(node, ints, refined, scheduled, lists, events, queue, tail)
+    for node in lists[OPENED, : events[OPENED]]:
         if _is_active(node, True, ints, refined) and not is_set(scheduled, node):
             set_bit(scheduled, node)
-            _append(node, WAITING, lists, counts)
+            _append(node, WAITING, lists, events)
     return tested
 
 
