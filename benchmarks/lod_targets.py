@@ -115,9 +115,12 @@ def teleport_verdicts(place: Place, streaming: Row, auto: Row) -> Iterator[Verdi
     """
     if place.leaves_m <= 4:
         return
-    for what, key in (("worst search after teleports", "max_ms"), ("first search", "first_ms")):
+    for what, key in (
+        ("worst search after teleports", "cpu_max_ms"),
+        ("first search", "cpu_first_ms"),
+    ):
         value = auto[key] / streaming[key]
-        text = f"{place.name}: {what} of auto, times streaming's (wall)"
+        text = f"{place.name}: {what} of auto, times streaming's"
         yield Verdict(text, value, WORST_OF_STREAMING)
 
 

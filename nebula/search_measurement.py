@@ -123,7 +123,9 @@ def _row(
         "p99_ms": float(np.percentile(counted, 99)),
         "max_ms": float(counted.max()),
         "cpu_p50_ms": float(np.percentile(cpu_ms[DROPPED:], 50)),  # of all threads together
+        "cpu_max_ms": float(max(cpu_ms[DROPPED:])),
         "first_ms": first_ms,
+        "cpu_first_ms": cpu_ms[0],
         "threads": threads(),
     }
 

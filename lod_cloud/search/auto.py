@@ -13,7 +13,7 @@ from lod_cloud.search.search_tree import SearchTree
 from lod_cloud.search.wheel import WheelSearch
 
 _TESTS_SHARE = 1 / 128  # of the nodes the last full search tested: what the wheel may test instead
-_FILL_SHARE = 1 / 512  # likewise, the entries that may be made beside a full search
+_FILL_SHARE = 1 / 256  # likewise, the entries that may be made beside a full search
 _LEAST = 256
 
 

@@ -97,7 +97,9 @@ def _rows(
     found: Sequence[dict[str, Any]], nodes: int, levels: int, gpu: Gpu
 ) -> list[dict[str, Any]]:
     """The measured rows with GPU times and ratios to the baselines."""
-    uncounted = dict.fromkeys(("p50_ms", "p99_ms", "max_ms", "cpu_p50_ms", "first_ms"))
+    uncounted = dict.fromkeys(
+        ("p50_ms", "p99_ms", "max_ms", "cpu_p50_ms", "cpu_max_ms", "first_ms", "cpu_first_ms")
+    )
     variants = [{**_of(found, basis), **uncounted, "method": v} for v, basis in VARIANTS.items()]
     rows = []
     for row in (*found, *variants):

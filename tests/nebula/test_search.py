@@ -46,6 +46,7 @@ def test_all_methods_are_compared(options: SearchOptions) -> None:
     for name, row in rows.items():
         assert row["searches"] == 31 - 10
         assert 0 < row["p50_ms"] <= row["p99_ms"] <= row["max_ms"]
+        assert 0 < row["cpu_p50_ms"] <= row["cpu_max_ms"] and row["cpu_first_ms"] > 0
         assert set(row["overlap"]) == {"4", "8", "16", "32", "64"}
         assert all(0 < share <= 1 for share in row["overlap"].values())
         assert row["identical_to_flat"] == (row["searches"] if name in SEARCHES else None)
