@@ -7,6 +7,7 @@ metres: metres = units / ``units_per_metre``.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -24,6 +25,12 @@ View = tuple[Point, Point]  # eye, look-at point
 _FRAME_TANGENT = 0.8  # auto-framing puts the box within |x/z|, |y/z| <= this (77 degrees)
 _ELEVATION_RAD = math.radians(20.0)
 _BOX_PERCENTILES = (1.0, 99.0)
+
+
+def point(coordinates: Iterable[float]) -> Point:
+    """Three numbers, such as an array [3], as plain Python floats: what JSON and equality like."""
+    x, y, z = (float(c) for c in coordinates)
+    return x, y, z
 
 
 @dataclass(frozen=True)

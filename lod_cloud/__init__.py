@@ -5,7 +5,7 @@ from lod_cloud.client import Client, ReceiveStats, Selection
 from lod_cloud.cloud import Cloud
 from lod_cloud.codec import Codec, CompactCodec, PaperCodec
 from lod_cloud.criterion import SearchRequest, prove_nesting
-from lod_cloud.cut import Cut, difference, is_complete, overlap
+from lod_cloud.cut import Cut, is_complete, overlap
 from lod_cloud.delta_cut import DeltaCut, Probe, Report
 from lod_cloud.leaf_spool import LeafSpool
 from lod_cloud.link import Link
@@ -46,7 +46,6 @@ __all__ = [
     "TreeMetadata",
     "build_tree",
     "build_tree_files",
-    "difference",
     "flat_search",
     "is_complete",
     "load_tree",

@@ -42,20 +42,13 @@ def is_complete(tree: LodTree, node_ids: Int32) -> bool:
     )
 
 
-def difference(ids: Int32, other: Int32) -> Int32:
-    """Members of ``ids`` that are not in ``other``, in the order of ``ids``; both without
+def without(ids: Int32, others: Int32) -> Int32:
+    """Members of ``ids`` that are not in ``others``, in the order of ``ids``; both without
     duplicates.
     """
-    return ids[~np.isin(ids, other, assume_unique=True, kind="table")]
+    return ids[~np.isin(ids, others, assume_unique=True)]
 
 
 def overlap(before: Cut, after: Cut) -> float:
     """Share of ``after`` that was already in ``before`` (Fig. 7); 1 for equal cuts."""
-    return 1.0 - len(difference(after.node_ids, before.node_ids)) / len(after)
-
-
-def without(ids: Int32, others: Int32) -> Int32:
-    """As `difference`, at a cost that depends on how many the members are, not on their numbers:
-    for changes rather than cuts.
-    """
-    return ids[~np.isin(ids, others, assume_unique=True)]
+    return 1.0 - len(without(after.node_ids, before.node_ids)) / len(after)

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gaussians.errors import InputError
+from gaussians.placement import Point
 from gaussians.scene import Scene
 from lod_cloud.search_arrays import SearchArrays
 
 Int32 = NDArray[np.int32]
 Float32 = NDArray[np.float32]
-Point = tuple[float, float, float]
 
 
 @dataclass(frozen=True)

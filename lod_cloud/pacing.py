@@ -26,9 +26,10 @@ from numpy.typing import NDArray
 
 from lod_cloud.criterion import SearchRequest
 from lod_cloud.lod_tree import Int32
-from lod_cloud.pacing_kernels import expand_first, forest, include_below, set_marks
+from lod_cloud.pacing_kernels import expand_first, forest, include_below
 from lod_cloud.search import SearchTree
 from lod_cloud.search.events import nodes_that_differ
+from lod_cloud.search.marks import set_marks
 from lod_cloud.search.search_tree import Marks
 
 FIRST_STAGE_PX = 120.0  # each of the following is half of the one before

@@ -7,20 +7,10 @@ import math
 import numpy as np
 from numba import njit
 
-from lod_cloud.search.marks import clear_bit, is_set, set_bit
+from lod_cloud.search.marks import is_set
 
 _SHIFT = 17  # of a float32's bits: 64 steps of error per factor of two, 1.1 % each
 _BINS = (0x7F800000 >> _SHIFT) + 1  # the last one is infinity
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def set_marks(nodes, marks, value):  # type: ignore[no-untyped-def]
-    """Set or clear the bits of nodes."""
-    for node in nodes:
-        if value:
-            set_bit(marks, node)
-        else:
-            clear_bit(marks, node)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

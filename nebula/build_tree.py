@@ -14,6 +14,7 @@ import numpy as np
 
 from gaussians.errors import InputError
 from gaussians.parallel import threads
+from gaussians.placement import point
 from gaussians.rotations import up_vector
 from gaussians.synthetic import TiledCity
 from lod_cloud import (
@@ -109,7 +110,7 @@ def _of_tiles(tiled: TiledTree, options: BuildTreeOptions, rules: BuildOptions) 
     """The leaves pass through a spool beside the tree, so that they need not fit in memory."""
     city = TiledCity(tiled.leaves, tiled.density, options.seed, tiled.sh_degree)
     name = f"{tiled.density} of {city.leaves} leaves, seed {city.seed}"
-    path = [_point(p) for p in city.path]
+    path = [point(p) for p in city.path]
     folder = _existing_parent(options.out)
     begin = time.perf_counter()
     with (
@@ -148,13 +149,8 @@ def _existing_parent(target: Path) -> Path:
 def _position(place: SceneInput) -> dict[str, Any]:
     """What a tree records about where it stands."""
     return {
-        "up": _point(up_vector(place.placement.up)),
+        "up": point(up_vector(place.placement.up)),
         "units_per_metre": place.placement.units_per_metre,
-        "start": _point(place.view.position),
+        "start": point(place.view.position),
         "path": place.walkable_path,
     }
-
-
-def _point(coordinates: Any) -> tuple[float, float, float]:
-    x, y, z = (float(c) for c in coordinates)
-    return x, y, z

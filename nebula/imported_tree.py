@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 from gaussians.errors import InputError
 from gaussians.formats import load_lod_set
 from gaussians.formats.layout import read_composition
-from gaussians.placement import Point, parse_view
+from gaussians.placement import Point, parse_view, point
 from gaussians.rotations import up_vector
 from lod_cloud import BuildOptions, BuildTimes, LodTree, prove_nesting, save_tree
 from lod_cloud.imports import build_block_tree, build_instanced_files, build_octree
@@ -67,9 +67,9 @@ def _in_memory(
     with progress(f"building {options.out}"):
         begin, cpu = time.perf_counter(), os.times().user
         tree = make(
-            up=_point(up_vector(place.placement.up)),
+            up=point(up_vector(place.placement.up)),
             units_per_metre=place.placement.units_per_metre,
-            start=_point(place.view.position),
+            start=point(place.view.position),
         )
         build_s, cpu_s = time.perf_counter() - begin, os.times().user - cpu
         begin = time.perf_counter()
@@ -98,14 +98,9 @@ def _instances(path: Path, options: BuildTreeOptions, rules: BuildOptions) -> _R
         times = build_instanced_files(
             composition,
             options.out,
-            up=_point(up_vector(scene.up or "-y")),
+            up=point(up_vector(scene.up or "-y")),
             units_per_metre=scene.units_per_metre,
             start=start,
             options=rules,
         )
     return path.name, read_s, times
-
-
-def _point(coordinates: Iterable[float]) -> Point:
-    x, y, z = (float(c) for c in coordinates)
-    return x, y, z

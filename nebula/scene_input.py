@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gaussians.cameras import Pose
 from gaussians.errors import InputError
 from gaussians.formats import load_scene
-from gaussians.placement import Placement, Point, View, anchor, parse_view
+from gaussians.placement import Placement, Point, View, anchor, parse_view, point
 from gaussians.poses import GENERATED_RATE_HZ, HeadTrace, generate_trace, read_eyenavgs, resample
 from gaussians.scene import Scene
 from gaussians.synthetic import BenchmarkView, benchmark_scene, generate_city
@@ -54,13 +53,13 @@ def load(options: SceneOptions, seed: int) -> SceneInput:
         with progress(f"generating a city of {source.city} leaves"):
             city = generate_city(source.city, seed)
         name, scene = f"city of {source.city} leaves, seed {seed}", city.scene
-        default_up, default_view = city.up, (_point(city.eye), _point(city.target))
-        path = tuple(_point(p) for p in city.path)
+        default_up, default_view = city.up, (point(city.eye), point(city.target))
+        path = tuple(point(p) for p in city.path)
     elif isinstance(source, BenchmarkView):
         with progress(f"generating the view {source.name}"):
             scene, rig = benchmark_scene(source)
         name, eye = f"benchmark view {source.name}", rig.pose.position
-        default_up, default_view = "+z", (_point(eye), _point(eye + rig.pose.rotation[:, 2]))
+        default_up, default_view = "+z", (point(eye), point(eye + rig.pose.rotation[:, 2]))
     else:
         with progress(f"reading {source}"):
             scene, files = load_scene(source, options.level)
@@ -79,11 +78,6 @@ def load(options: SceneOptions, seed: int) -> SceneInput:
         walkable_path=path,
         files=tuple(files),
     )
-
-
-def _point(coordinates: Sequence[float] | NDArray[np.float64]) -> Point:
-    x, y, z = (float(c) for c in coordinates)
-    return x, y, z
 
 
 def head_trace(name: str, view: Pose, up: str, frames: int, rate_hz: float, seed: int) -> HeadTrace:

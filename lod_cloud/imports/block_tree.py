@@ -31,6 +31,7 @@ import numpy as np
 
 from gaussians.errors import InputError
 from gaussians.formats.lod_meta import LodSet
+from gaussians.placement import point
 from gaussians.scene import Scene, concatenate
 from lod_cloud.build import BuildOptions, build_tree
 from lod_cloud.imports.numbering import tree_from_parents
@@ -79,7 +80,7 @@ def build_block_tree(
         "left_out": [list(pair) for pair in left_out],
     }
     finest = scaled[min(scaled)].means
-    bounds = _point(finest.min(axis=0)), _point(finest.max(axis=0))
+    bounds = point(finest.min(axis=0)), point(finest.max(axis=0))
     return tree_from_parents(
         parent,
         concatenate([given.gaussians, top.gaussians.take(inner)]),
@@ -191,8 +192,3 @@ def nearest_parents(fine: Float32, coarse: Float32) -> Int32:
             nearest[child], counts[node] = node, 1
         childless, wanted = np.array(left, np.int64), 4 * wanted
     return nearest
-
-
-def _point(coordinates: Float32) -> Point:
-    x, y, z = (float(c) for c in coordinates)
-    return x, y, z

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from gaussians.composition import Composition
 from gaussians.errors import InputError
 from gaussians.parallel import run_chunks
+from gaussians.placement import point
 from gaussians.rotations import rotations_from_quaternions
 from gaussians.scene import FIELDS, Scene
 from gaussians.transforms import transformed
@@ -135,7 +136,7 @@ class _Copies:
         centre = np.einsum("i,ijk,ik->ij", self.scales, self.rotations, middle) + self.positions
         reach = np.einsum("i,ijk,ik->ij", self.scales, np.abs(self.rotations), half)
         low, high = (centre - reach).min(axis=0), (centre + reach).max(axis=0)
-        return _point(low), _point(high)
+        return point(low), point(high)
 
     def first_leaf_ids(self) -> Int64:
         """[I] id of a copy's first Gaussian in the composition."""
@@ -286,8 +287,3 @@ def _write_top(top: LodTree, places: _Places, spheres: Float32, files: _Files) -
     for row, number in enumerate(places.top[inner].tolist()):
         for name, column in columns.items():
             files[name].write(number, column[row : row + 1])
-
-
-def _point(coordinates: NDArray[np.float64]) -> Point:
-    x, y, z = (float(c) for c in coordinates)
-    return x, y, z

@@ -16,6 +16,7 @@ import numpy as np
 
 from gaussians.constants import OPACITY_LIMIT
 from gaussians.errors import InputError
+from gaussians.placement import point
 from gaussians.scene import Scene, concatenate
 from lod_cloud.imports.numbering import tree_from_parents
 from lod_cloud.lod_tree import Int32, LodTree, Point, TreeMetadata
@@ -61,7 +62,7 @@ def build_octree(
         "levels": levels,
         "edge_m": edge,
     }
-    bounds_m = _point(low), _point(means.max(axis=0))
+    bounds_m = point(low), point(means.max(axis=0))
     leaf_id = np.concatenate([np.full(len(merged), -1, np.int32), ids])
     metadata = TreeMetadata(bounds_m, up, units_per_metre, start, build=build)
     tree = tree_from_parents(parent, gaussians, radius, extent, leaf_id, metadata)
@@ -115,8 +116,3 @@ def _voxels(codes: np.ndarray, levels: int) -> tuple[Int32, Int32]:
 def _within(sizes: np.ndarray) -> np.ndarray:
     """0 .. size - 1 for each size, one after another."""
     return np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-
-
-def _point(coordinates: np.ndarray) -> Point:
-    x, y, z = (float(c) for c in coordinates)
-    return x, y, z

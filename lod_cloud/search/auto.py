@@ -9,6 +9,7 @@ import numpy as np
 from lod_cloud.criterion import SearchRequest
 from lod_cloud.lod_tree import Int32
 from lod_cloud.search import wheel_decisions as decisions
+from lod_cloud.search.marks import set_marks
 from lod_cloud.search.search_tree import SearchTree
 from lod_cloud.search.wheel import WheelSearch
 
@@ -45,8 +46,8 @@ class AutoSearch(WheelSearch):
             return self._fill_further(request, due)
         expanded, collapsed, tested = self._settle(due, budget)
         if tested > budget:
-            decisions.set_marks(expanded, self.refined, False)
-            decisions.set_marks(collapsed, self.refined, True)
+            set_marks(expanded, self.refined, False)
+            set_marks(collapsed, self.refined, True)
             return self._jump(request, tested)
         return np.sort(expanded), np.sort(collapsed), tested, self._touched(len(due), tested)
 
@@ -61,7 +62,7 @@ class AutoSearch(WheelSearch):
 
     def _fill_further(self, request: SearchRequest, due: Int32) -> tuple[Int32, Int32, int, int]:
         """A full search; entries that are due or became active are made anew, and some more."""
-        decisions.set_marks(due, self._scheduled, False)
+        set_marks(due, self._scheduled, False)
         expanded, collapsed, tested, touched = self._stream(request)
         self._full_tests = tested
         changed = np.concatenate([due, expanded, collapsed])

@@ -34,6 +34,16 @@ def clear_bit(marks, node):  # type: ignore[no-untyped-def]
     marks[node >> 3] &= np.uint8(255 - (1 << (node & 7)))
 
 
+@njit(cache=True, error_model="numpy", nogil=True)
+def set_marks(nodes, marks, value):  # type: ignore[no-untyped-def]
+    """Set (or clear) the marks of nodes."""
+    for node in nodes:
+        if value:
+            set_bit(marks, node)
+        else:
+            clear_bit(marks, node)
+
+
 @njit
 def any_set(marks, first, count):  # type: ignore[no-untyped-def]
     """Whether any of ``count`` nodes from ``first`` on has its bit set."""

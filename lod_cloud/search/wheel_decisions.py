@@ -245,16 +245,6 @@ def active_among(nodes, ints, refined, scheduled):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def set_marks(nodes, marks, value):  # type: ignore[no-untyped-def]
-    """Set (or clear) the marks of nodes."""
-    for node in nodes:
-        if value:
-            set_bit(marks, node)
-        else:
-            clear_bit(marks, node)
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
 def children_of(nodes, ints):  # type: ignore[no-untyped-def]
     """How many children nodes have together."""
     total = 0

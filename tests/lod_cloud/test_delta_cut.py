@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from gaussians.errors import InputError
 from lod_cloud.child_numbers import ChildNumbers
-from lod_cloud.cut import difference
+from lod_cloud.cut import without
 from lod_cloud.delta_cut import DeltaCut, Probe, Report
 from lod_cloud.lod_tree import Int32
 from lod_cloud.management_table import IN_CUT, ManagementTable, TableChange
@@ -26,7 +26,7 @@ def apply(table: ManagementTable, cut: set[int]) -> TableChange:
     """What a search changes that found ``cut``; the change is made."""
     before, after = table.cut_ids, ids(*sorted(cut))
     index = table.search_index + 1
-    change = table.prepare_step(index, difference(after, before), difference(before, after))
+    change = table.prepare_step(index, without(after, before), without(before, after))
     table.commit(change)
     return change
 

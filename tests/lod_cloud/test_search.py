@@ -8,7 +8,7 @@ from hypothesis import given, settings
 
 from gaussians import parallel
 from lod_cloud.criterion import SearchRequest
-from lod_cloud.cut import Cut, crossings, difference, is_complete, overlap
+from lod_cloud.cut import Cut, crossings, is_complete, overlap, without
 from lod_cloud.lod_tree import LodTree
 from lod_cloud.search import flat_search
 from tests.lod_cloud.trees import random_tree, requests, trees
@@ -83,7 +83,7 @@ def cut_of(*ids: int) -> Cut:
 def test_overlap_and_difference() -> None:
     assert overlap(cut_of(1, 2, 3), cut_of(2, 3, 4, 5)) == pytest.approx(0.5)
     assert overlap(cut_of(1, 2), cut_of(1, 2)) == 1.0
-    assert difference(np.array([9, 2, 5]), np.array([5, 7])).tolist() == [9, 2]
+    assert without(np.array([9, 2, 5]), np.array([5, 7])).tolist() == [9, 2]
 
 
 def test_incomplete_sets_are_recognised() -> None:

@@ -10,7 +10,7 @@ import pytest
 from gaussians import parallel
 from gaussians.errors import InputError
 from lod_cloud.criterion import SearchRequest
-from lod_cloud.cut import difference
+from lod_cloud.cut import without
 from lod_cloud.search import SEARCHES, Search, SearchTree, ValiditySearch, auto, make_search
 from tests.lod_cloud.search_trees import PATHS, TREES, requests_along, shaped_tree
 from tests.naive import search as naive
@@ -286,6 +286,6 @@ def test_events_are_the_difference_of_cuts(trees: dict[str, SearchTree]) -> None
     before = np.empty(0, np.int32)
     for request in requests_along("flight", tree, 30, np.random.default_rng(5)):
         result = search.search(request)
-        assert np.array_equal(result.added, difference(result.cut, before))
-        assert np.array_equal(result.removed, difference(before, result.cut))
+        assert np.array_equal(result.added, without(result.cut, before))
+        assert np.array_equal(result.removed, without(before, result.cut))
         before = result.cut
