@@ -69,16 +69,15 @@ def stays_refined(cx, cy, cz, mx, my, mz, radius, extent, k, grow, was):  # type
 def test_group(group, cx, cy, cz, k, grow, groups, before):  # type: ignore[no-untyped-def]
     """The marks of a group of 16 nodes, as a number, from those it had ``before``.
 
-    Nodes whose parent is not refined come out as not refined, because the test is nested.
+    Nodes whose parent is not refined come out as not refined, because the test is nested. Without
+    a branch on ``grow``: with one, references to the arrays are counted for every group.
     """
-    now = _inside(group, cx, cy, cz, k, ONE, groups)
-    if grow > ONE:
-        now |= np.intp(before[group]) & _inside(group, cx, cy, cz, k, grow, groups)
-    return now
+    stay = np.intp(before[group]) & inside_group(group, cx, cy, cz, k, grow, groups)
+    return stay | inside_group(group, cx, cy, cz, k, ONE, groups)
 
 
 @njit(forceinline=True)
-def _inside(group, cx, cy, cz, k, scale, groups):  # type: ignore[no-untyped-def]
+def inside_group(group, cx, cy, cz, k, scale, groups):  # type: ignore[no-untyped-def]
     """The node test of 16 nodes at once, as a number."""
     start = np.intp(group) * GROUP_NUMBERS
     x, y, z = load(groups, start), load(groups, start + GROUP), load(groups, start + 2 * GROUP)

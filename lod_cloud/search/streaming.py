@@ -13,7 +13,7 @@ from lod_cloud.criterion import SearchRequest
 from lod_cloud.lod_tree import Int32
 from lod_cloud.search.flat import BYTES_PER_TEST
 from lod_cloud.search.interface import FullSearch
-from lod_cloud.search.marks import longer, test_group
+from lod_cloud.search.marks import test_group
 from lod_cloud.search.prefetching import prefetch
 from lod_cloud.search.search_tree import Marks
 from lod_cloud.search_arrays import GROUP, GROUP_NUMBERS, GROUP_ROWS
@@ -73,7 +73,10 @@ def _descend(  # type: ignore[no-untyped-def]
     Returns the number of groups tested, those that wait, and the new ``last``. Another thread may
     test the same group, and finds the same.
     """
-    queue = longer(groups_first, 1024)
+    # room for all groups, of which memory is taken by what is written: an array that is replaced
+    # by a longer one has its references counted in every turn of the loop
+    queue = np.empty(len(groups_first) + len(groups), np.int32)
+    queue[: len(groups_first)] = groups_first
     head, tail = 0, len(groups_first)
     while head < tail and tail - head <= most:
         if head + _AHEAD < tail:
@@ -92,8 +95,6 @@ def _descend(  # type: ignore[no-untyped-def]
         final = group * GROUP + highest_bit(now)
         begin = max(last + 1, first_child[first] // GROUP)
         last = max(last, (first_child[final] + child_count[final] - 1) // GROUP)
-        if tail + last + 1 - begin > len(queue):
-            queue = longer(queue, last + 1 - begin)
         for below in range(begin, last + 1):
             queue[tail] = below
             tail += 1
