@@ -43,7 +43,8 @@ class DepthFirstSearch(FullSearch):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _descend(cx, cy, cz, k, grow, first_child, child_count, means, radius, extent, before, marks):  # type: ignore[no-untyped-def]
-    stack = np.zeros(64, np.int32)
+    stack = np.empty(len(child_count), np.int32)  # memory is taken by what is written
+    stack[0] = 0
     depth = 1
     tested = 0
     while depth:
@@ -56,10 +57,6 @@ def _descend(cx, cy, cz, k, grow, first_child, child_count, means, radius, exten
         ):  # fmt: skip
             continue
         set_bit(marks, node)
-        while depth + child_count[node] > len(stack):
-            larger = np.empty(2 * len(stack), np.int32)
-            larger[: len(stack)] = stack
-            stack = larger
         for child in range(first_child[node] + child_count[node] - 1, first_child[node] - 1, -1):
             stack[depth] = child
             depth += 1

@@ -83,11 +83,3 @@ def inside_group(group, cx, cy, cz, k, scale, groups):  # type: ignore[no-untype
     x, y, z = load(groups, start), load(groups, start + GROUP), load(groups, start + 2 * GROUP)
     radius, extent = load(groups, start + 3 * GROUP), load(groups, start + 4 * GROUP)
     return bits(refines(cx, cy, cz, x, y, z, scale * radius, extent, scale * k))
-
-
-@njit
-def longer(array, least):  # type: ignore[no-untyped-def]
-    """A copy of a list of nodes with room for as many again, and ``least`` more."""
-    larger = np.empty(2 * len(array) + least, np.int32)
-    larger[: len(array)] = array
-    return larger

@@ -134,7 +134,13 @@ class WheelSearch(Search):
         """Schedule active nodes from node ``begin`` on; where to go on."""
         tree = self.tree
         nodes, at = decisions.active_nodes(
-            begin, most, tree.first_child, tree.child_count, self.refined, self._scheduled
+            begin,
+            most,
+            tree.first_child,
+            tree.child_count,
+            self.refined,
+            self.refined.view(np.uint64),
+            self._scheduled,
         )
         self._insert(nodes)
         return int(at)

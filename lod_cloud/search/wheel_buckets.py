@@ -31,7 +31,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lod_cloud.search.marks import ONE, longer
+from lod_cloud.search.marks import ONE
 from lod_cloud.search.prefetching import BATCH, gather, prefetch
 from lod_cloud.search.sectors import SECTORS, reach, sector_of
 
@@ -151,14 +151,12 @@ def collect(step, hands, rates, heads, counts, chunks, axes, cosines, sines):  #
         return np.empty(0, np.int32)
     spans = np.empty((HANDS, 4), np.int32)
     _advance(step, hands, rates, axes, cosines, sines, spans)
-    taken = np.empty(4096, np.int32)
+    taken = np.empty(BUCKETS, np.int32)
     count = _take(BUCKETS - 1, heads, chunks, taken, 0)
     for hand in range(HANDS):
         later = min(hand + _HANDS_AHEAD, HANDS - 1)
         ahead = np.intp(spans[later, 2]) & (COARSE - 1)
         prefetch(heads, COARSE_BEGIN + later * COARSE + ahead)
-        if count + FINE + COARSE > len(taken):
-            taken = longer(taken, FINE + COARSE)
         for fine in range(spans[hand, 0], spans[hand, 0] + spans[hand, 1]):
             bucket = hand * FINE + (fine & (FINE - 1))
             count = _take(bucket, heads, chunks, taken, count)
@@ -173,13 +171,11 @@ def collect(step, hands, rates, heads, counts, chunks, axes, cosines, sines):  #
 @njit
 def _release(counts, chunks, taken):  # type: ignore[no-untyped-def]
     """The node ids in the buckets that began with these chunks; their chunks become free."""
-    due = np.empty(PER_CHUNK * (len(taken) + 64), np.int32)
+    due = np.empty(counts[ENTRIES], np.int32)
     found = 0
     for head in taken:
         chunk, held = head >> 4, head & 15
         while chunk >= 0:
-            if found + PER_CHUNK > len(due):
-                due = longer(due, PER_CHUNK)
             for j in range(1, held + 1):
                 due[found] = chunks[chunk, j]
                 found += 1

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lod_cloud.search.marks import any_set, clear_bit, is_set, longer, set_bit, stays_refined
+from lod_cloud.search.marks import any_set, clear_bit, is_set, set_bit, stays_refined
 from lod_cloud.search.prefetching import BATCH, gather, prefetch
 from lod_cloud.search.wheel_buckets import ENTRIES, chunks_for, find_keys, put
 from lod_cloud.search_arrays import CHILD_COUNT, FIRST_CHILD, PARENT, RECORD_COLUMNS
@@ -179,14 +179,16 @@ def settle(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def active_nodes(begin, most, first_child, child_count, refined, scheduled):  # type: ignore[no-untyped-def]
+def active_nodes(begin, most, first_child, child_count, refined, words, scheduled):  # type: ignore[no-untyped-def]
     """Active nodes without entry among refined nodes, from node ``begin`` on, and
     their children, until ``most`` were found; and where to go on. Marks them as scheduled.
+
+    ``words`` are the marks ``refined``, 64 at a time.
     """
-    waiting = np.empty(1024, np.int32)
+    nodes = len(child_count)
+    waiting = np.empty(nodes, np.int32)  # memory is taken by what is written
     made = 0
     node = begin
-    nodes = len(child_count)
     if not is_set(refined, 0):
         node = nodes
         if child_count[0] and not is_set(scheduled, 0):
@@ -194,14 +196,12 @@ def active_nodes(begin, most, first_child, child_count, refined, scheduled):  # 
             waiting[made] = 0
             made = 1
     while node < nodes and made < most:
-        if node & 7 == 0 and refined[node >> 3] == 0:
-            node += 8
+        if node & 63 == 0 and words[node >> 6] == 0:
+            node += 64
             continue
         if is_set(refined, node):
             any_refined = False
             first, count = first_child[node], child_count[node]
-            if made + count + 1 > len(waiting):
-                waiting = longer(waiting, count + 1)
             for child in range(first, first + count):
                 if is_set(refined, child):
                     any_refined = True
@@ -214,7 +214,7 @@ def active_nodes(begin, most, first_child, child_count, refined, scheduled):  # 
                 waiting[made] = node
                 made += 1
         node += 1
-    return waiting[:made], min(node, nodes)
+    return waiting[:made].copy(), min(node, nodes)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -222,12 +222,10 @@ def active_among(nodes, ints, refined, scheduled):  # type: ignore[no-untyped-de
     """Those of the nodes, of their parents and of their children that are active and have no
     entry. Marks them as scheduled.
     """
-    waiting = np.empty(1024, np.int32)
+    waiting = np.empty(len(ints), np.int32)
     made = 0
     for node in nodes:
         first, count = ints[node, FIRST_CHILD], ints[node, CHILD_COUNT]
-        if made + count + 2 > len(waiting):
-            waiting = longer(waiting, count + 2)
         for i in range(-2, count):
             near = first + i
             if i < 0:
@@ -241,7 +239,7 @@ def active_among(nodes, ints, refined, scheduled):  # type: ignore[no-untyped-de
                 set_bit(scheduled, near)
                 waiting[made] = near
                 made += 1
-    return waiting[:made]
+    return waiting[:made].copy()
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
