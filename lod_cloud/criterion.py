@@ -74,7 +74,7 @@ class SearchRequest:
         return np.array(self.position, np.float32)
 
 
-@njit
+@njit(forceinline=True)
 def refines(cx, cy, cz, mx, my, mz, radius, extent, k):  # type: ignore[no-untyped-def]
     """The node test, float32 throughout, in this order, without fused multiply-add.
 

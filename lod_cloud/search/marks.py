@@ -18,18 +18,18 @@ from lod_cloud.search_arrays import GROUP, GROUP_NUMBERS
 ONE = np.float32(1.0)
 
 
-@njit
+@njit(forceinline=True)
 def is_set(marks, node):  # type: ignore[no-untyped-def]
     """Whether the bit of a node is set."""
     return (marks[node >> 3] >> (node & 7)) & 1 != 0
 
 
-@njit
+@njit(forceinline=True)
 def set_bit(marks, node):  # type: ignore[no-untyped-def]
     marks[node >> 3] |= np.uint8(1 << (node & 7))
 
 
-@njit
+@njit(forceinline=True)
 def clear_bit(marks, node):  # type: ignore[no-untyped-def]
     marks[node >> 3] &= np.uint8(255 - (1 << (node & 7)))
 
@@ -44,7 +44,7 @@ def set_marks(nodes, marks, value):  # type: ignore[no-untyped-def]
             clear_bit(marks, node)
 
 
-@njit
+@njit(forceinline=True)
 def any_set(marks, first, count):  # type: ignore[no-untyped-def]
     """Whether any of ``count`` nodes from ``first`` on has its bit set."""
     for node in range(first, first + count):  # noqa: SIM110 (compiled: no generators)
@@ -53,7 +53,7 @@ def any_set(marks, first, count):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit
+@njit(forceinline=True)
 def stays_refined(cx, cy, cz, mx, my, mz, radius, extent, k, grow, was):  # type: ignore[no-untyped-def]
     """The node test of a node that was (not) refined before: hysteresis.
 

@@ -19,7 +19,7 @@ _SLACK = 2.0**-21  # of T; the float32 test agrees with real numbers beyond half
 _TINY = 1e-15  # metres
 
 
-@njit
+@njit(forceinline=True)
 def _margin(node, cx, cy, cz, floats, k, grow, now):  # type: ignore[no-untyped-def]
     """How far the camera may come before the decision on a node can change."""
     t = floats[node, 3] + k * floats[node, 4]
@@ -32,7 +32,7 @@ def _margin(node, cx, cy, cz, floats, k, grow, now):  # type: ignore[no-untyped-
     return (-away if now else away) - (np.float64(t) * _SLACK + _TINY)
 
 
-@njit
+@njit(forceinline=True)
 def _decide(node, cx, cy, cz, floats, k, grow, was):  # type: ignore[no-untyped-def]
     return stays_refined(
         cx, cy, cz, floats[node, 0], floats[node, 1], floats[node, 2],
@@ -40,7 +40,7 @@ def _decide(node, cx, cy, cz, floats, k, grow, was):  # type: ignore[no-untyped-
     )  # fmt: skip
 
 
-@njit
+@njit(forceinline=True)
 def _treelet_of(node, ints, roots):  # type: ignore[no-untyped-def]
     """Root of the treelet a node is a node of."""
     node = ints[node, PARENT]
@@ -49,14 +49,14 @@ def _treelet_of(node, ints, roots):  # type: ignore[no-untyped-def]
     return node
 
 
-@njit
+@njit(forceinline=True)
 def _is_valid(ball, cx, cy, cz):  # type: ignore[no-untyped-def]
     """Whether the camera is where no decision of a treelet can have changed."""
     dx, dy, dz = cx - ball[0], cy - ball[1], cz - ball[2]
     return dx * dx + dy * dy + dz * dz < ball[3] * ball[3] * (1.0 - 1e-9)
 
 
-@njit
+@njit(forceinline=True)
 def _ask_for(root, bearing, queue, queued):  # type: ignore[no-untyped-def]
     """Have a treelet tested that bore nothing; returns the new length of the queue."""
     if is_set(bearing, root):
@@ -66,7 +66,7 @@ def _ask_for(root, bearing, queue, queued):  # type: ignore[no-untyped-def]
     return queued + 1
 
 
-@njit
+@njit(forceinline=True)
 def _test_below(  # type: ignore[no-untyped-def]
     root, cx, cy, cz, k, grow, floats, ints, roots, refined, bearing, keep,
     least, stack, opened, n_opened, queue, queued, shut,
@@ -111,7 +111,7 @@ def _test_below(  # type: ignore[no-untyped-def]
     return bears, least, tested, n_opened, queued, shutting
 
 
-@njit
+@njit(forceinline=True)
 def _close(root, ints, roots, refined, shut, shutting, closed, n_closed):  # type: ignore[no-untyped-def]
     """Nodes in ``shut`` are not refined: nothing below them is, as far as this treelet goes.
 
