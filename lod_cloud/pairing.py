@@ -13,14 +13,15 @@ from numba import njit
 
 # Moments of a slot, in rows of MOST_SLOTS: first the covariance.
 MOST_SLOTS = 64
-MOMENTS = 14
+MOMENTS = 16
 MEANS = 13  # first rows, those that are weighted means; the mass is a sum
 # unsigned: with signed indices, which might count from the end, nothing is vectorised
 ROW = np.uint64(MOST_SLOTS)
 XX, XY, XZ, YY, YZ, ZZ = (np.uint64(row * MOST_SLOTS) for row in range(6))
 X, Y, Z = (np.uint64(row * MOST_SLOTS) for row in range(6, 9))
 RED, GREEN, BLUE = (np.uint64(row * MOST_SLOTS) for row in range(9, 12))
-OPACITY, MASS = (np.uint64(row * MOST_SLOTS) for row in range(12, 14))
+MEAN_OPACITY, MASS = (np.uint64(row * MOST_SLOTS) for row in range(12, 14))
+RADIUS, EXTENT = (np.uint64(row * MOST_SLOTS) for row in range(14, 16))  # float32 numbers
 
 COSTS_ROW = np.uint64(MOST_SLOTS + 4)  # columns of a row of costs, some spare
 _SLOT = np.int64(MOST_SLOTS - 1)  # bits of a cost that hold a slot

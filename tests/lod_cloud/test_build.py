@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,12 +13,11 @@ from hypothesis import strategies as st
 from gaussians import parallel
 from gaussians.errors import InputError
 from gaussians.scene import FIELDS, Scene
+from lod_cloud import build
 from lod_cloud.build import BuildOptions, build_tree
 from lod_cloud.criterion import SearchRequest, prove_nesting
 from lod_cloud.lod_tree import LodTree
 from lod_cloud.merge import merge_leaves
-from lod_cloud.numbering import number_nodes
-from lod_cloud.split import split_order
 from tests.lod_cloud.trees import random_scene, random_tree
 from tests.naive import lod_merge as naive
 
@@ -183,15 +183,12 @@ def test_nesting_holds_everywhere(count: int, seed: int, size_m: float) -> None:
     assert prove_nesting(random_tree(count, seed, size_m=size_m)) == 0
 
 
-def test_nesting_breaks_without_the_margin() -> None:
+def test_nesting_breaks_without_the_margin(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rounding up alone is not enough: the float32 node test rounds as well."""
     scene = random_scene(20_000, 7)
-    tree = build_tree(scene)
-    assert prove_nesting(tree) == 0
-    nodes, children = merge_leaves(scene, split_order(scene.means, 16), 16, margin=1.0)
-    rows = number_nodes(children, len(nodes.means) - 1, nodes.extent).nodes
-    bare = dataclasses.replace(tree, radius=nodes.radius[rows], extent=nodes.extent[rows])
-    assert prove_nesting(bare) > 100
+    assert prove_nesting(build_tree(scene)) == 0
+    monkeypatch.setattr(build, "merge_leaves", partial(merge_leaves, margin=1.0))
+    assert prove_nesting(build_tree(scene)) > 100
 
 
 def nasty_scenes() -> dict[str, Scene]:

@@ -273,6 +273,7 @@ MEMORY = """
 import sys
 from pathlib import Path
 import numpy as np
+import lod_cloud.build
 from gaussians.parallel import set_threads
 from gaussians.scene import Scene
 from lod_cloud import LeafSpool, SearchRequest, build_tree_files, load_tree
@@ -300,6 +301,7 @@ def search(folder):
     return peak_mb()
 
 set_threads(2)
+lod_cloud.build._MAPPED_BYTES = 1 << 22  # up to so much of the leaves in memory, however many
 folder = Path(sys.argv[1])
 if sys.argv[2] == "build":
     print(build(10_000, folder / "small"), build(200_000, folder / "large"))
