@@ -11,7 +11,8 @@ its mean) and its children's spheres:
     e = max(longest side of the box,  max over children e_ch (1 + 2^-19))
 
 The same scene gives the same bits on any number of threads, in memory and on disk. Memory: about
-250 B per leaf beside scene and result; harmonics pass through in blocks.
+120 B per leaf beside scene and result; harmonics pass through in blocks. Memory that is touched for
+the first time costs a build more than filling it, so arrays are few and small.
 """
 
 from __future__ import annotations
@@ -29,10 +30,9 @@ from numpy.typing import NDArray
 from gaussians.errors import InputError
 from gaussians.parallel import run_chunks
 from gaussians.scene import FIELDS, Scene
-from lod_cloud.array_file import ArrayFile
 from lod_cloud.criterion import LENGTH_LIMIT_M, prove_nesting
 from lod_cloud.harmonics import MemoryRows, merge_harmonics
-from lod_cloud.lod_tree import Float32, Int32, LodTree, Point, TreeMetadata
+from lod_cloud.lod_tree import Int32, LodTree, Point, TreeMetadata
 from lod_cloud.merge import merge_leaves
 from lod_cloud.nodes import FINISHED, Nodes
 from lod_cloud.numbering import Numbering, number_nodes
@@ -41,10 +41,12 @@ from lod_cloud.spheres import tighten_spheres
 from lod_cloud.split import split_order
 from lod_cloud.tree_files import TreeWriter
 
+Float64 = NDArray[np.float64]
+
 PAIR_WITHIN = 16
 _CHECKED_ROWS = 1 << 16
 _WRITTEN_ROWS = 1 << 16
-_MAPPED_BYTES = 1 << 30  # of leaves, about, that may stay mapped
+_MAPPED_BYTES = 1 << 29  # of leaves, about, that may stay mapped
 
 
 @dataclass(frozen=True)
@@ -88,15 +90,14 @@ def build_tree(
     Raises InputError for an empty or invalid scene, for coordinates or sizes beyond 1e12 m, and
     where merged opacities exceed 1e6.
     """
-    skeleton = _skeleton(scene, options, _Mapped(scene))
-    numbering = skeleton.numbering
+    numbering, nodes = _without_harmonics(scene, options, _Mapped(scene))
     count = len(numbering)
     arrays = {name: np.empty((count, *shape), np.float32) for name, shape in FINISHED.items()}
     leaf_id, masses = np.empty(count, np.int32), np.empty(count)
 
     def finish(begin: int, end: int) -> None:
         out = tuple(array[begin:end] for array in arrays.values())
-        skeleton.nodes.finish(begin, end, numbering.nodes, leaf_id, masses, out)
+        nodes.finish(begin, end, numbering.nodes, leaf_id, masses, out)
 
     run_chunks(finish, count)
     sh = np.empty((count, *scene.sh.shape[1:]), np.float32)
@@ -135,8 +136,7 @@ def build_tree_files(
     """
     begin, cpu = time.perf_counter(), os.times().user
     mapped = _Mapped(scene, release)
-    skeleton = _skeleton(scene, options, mapped)
-    numbering = skeleton.numbering
+    numbering, nodes = _without_harmonics(scene, options, mapped)
     metadata = TreeMetadata(_bounds(scene), up, units_per_metre, start, path, _record(options))
     counts = {
         "nodes": len(numbering),
@@ -145,28 +145,11 @@ def build_tree_files(
         "sh_degree": scene.sh_degree,
     }
     with TreeWriter(directory, counts, metadata) as writer:
-        for name in ("parent", "first_child", "child_count", "level_offsets"):
-            writer.put(name, getattr(numbering, name))
-        leaf_id, masses = np.empty(len(numbering), np.int32), np.empty(len(numbering))
-        files = [
-            writer.array(name, (len(numbering), *shape), np.float32)
-            for name, shape in FINISHED.items()
-        ]
-
-        def finish(begin: int, end: int) -> None:
-            for low in range(begin, end, _WRITTEN_ROWS):
-                high = min(low + _WRITTEN_ROWS, end)
-                out = tuple(file.target(low, high) for file in files)
-                skeleton.nodes.finish(low, high, numbering.nodes, leaf_id, masses, out)
-                mapped.was_read((high - low) // 2)
-                for file, rows in zip(files, out, strict=True):
-                    file.write(low, rows)
-
-        run_chunks(finish, len(numbering))
-        del skeleton
-        writer.put("leaf_id", leaf_id)
+        leaf_id, masses = _write_nodes(writer, numbering, nodes, mapped)
+        del nodes
         sh = writer.array("sh", (len(numbering), *scene.sh.shape[1:]), np.float32)
         merge_harmonics(numbering, masses, leaf_id, _flat(scene), sh, mapped.was_read)
+        release()
         cpu_s = os.times().user - cpu
         proof = time.perf_counter()
         violations = prove_nesting(writer.tree())
@@ -177,40 +160,59 @@ def build_tree_files(
     return BuildTimes(time.perf_counter() - begin - disk_s - proof_s, cpu_s, proof_s, disk_s)
 
 
-@dataclass(frozen=True)
-class _Skeleton:
-    """Everything but harmonics."""
+def _write_nodes(
+    writer: TreeWriter, numbering: Numbering, nodes: Nodes, mapped: _Mapped
+) -> tuple[Int32, Float64]:
+    """All arrays of the finished tree but harmonics; returns ids of leaves, and masses."""
+    for name in ("parent", "first_child", "child_count", "level_offsets"):
+        writer.put(name, getattr(numbering, name))
+    count = len(numbering)
+    leaf_id, masses = np.empty(count, np.int32), np.empty(count)
+    files = [writer.array(name, (count, *shape), np.float32) for name, shape in FINISHED.items()]
 
-    numbering: Numbering
-    nodes: Nodes
+    def finish(begin: int, end: int) -> None:
+        for low in range(begin, end, _WRITTEN_ROWS):
+            high = min(low + _WRITTEN_ROWS, end)
+            out = tuple(file.target(low, high) for file in files)
+            nodes.finish(low, high, numbering.nodes, leaf_id, masses, out)
+            mapped.was_read((high - low) // 2)
+            for file, rows in zip(files, out, strict=True):
+                file.write(low, rows)
+
+    run_chunks(finish, count)
+    writer.put("leaf_id", leaf_id)
+    return leaf_id, masses
 
 
 class _Mapped:
     """Leaves that may be memory-mapped: has them let go of when enough of them were read."""
 
     def __init__(self, scene: Scene, release: Callable[[], None] = lambda: None) -> None:
-        self._release, self._left, self._lock = release, 0, threading.Lock()
+        self._release, self._since, self._lock = release, 0, threading.Lock()
         widths = (math.prod(getattr(scene, name).shape[1:]) for name in FIELDS)
         self._most = _MAPPED_BYTES // (4 * sum(widths))
 
     def was_read(self, leaves: int) -> None:
         """So many more, by this thread; others may still read theirs."""
         with self._lock:
-            self._left += leaves
-            if self._left < self._most:
+            self._since += leaves
+            if self._since < self._most:
                 return
-            self._left = 0
+            self._since = 0
         self._release()
 
 
-def _skeleton(scene: Scene, options: BuildOptions, mapped: _Mapped) -> _Skeleton:
+def _without_harmonics(
+    scene: Scene, options: BuildOptions, mapped: _Mapped
+) -> tuple[Numbering, Nodes]:
+    """The nodes of the unfinished tree and their places in the finished one."""
     _check(scene, mapped)
     ids = split_order(scene.means, options.pair_within)
     nodes, children = merge_leaves(scene, ids, options.pair_within, was_read=mapped.was_read)
     numbering = number_nodes(children, 2 * len(scene) - 2, nodes.extent, options.fan_out_ratio)
     if options.fan_out_ratio < 1:
         tighten_spheres(numbering, nodes)
-    return _Skeleton(numbering, nodes)
+    return numbering, nodes
 
 
 def _check(scene: Scene, mapped: _Mapped) -> None:

@@ -64,6 +64,8 @@ def merge_harmonics(
     ``was_read`` is told how many more rows of ``sh`` were read.
     """
     clumps, above = _clumps(numbering.parent)
+    # from left to right: neighbours of any level read the same part of ``sh``
+    clumps.sort(key=lambda clump: _leftmost(numbering, clump[0]))
     width = sh.shape[1]
 
     def fill(low: int, high: int, below: int, children: Float32, rows: Float32) -> None:
@@ -137,9 +139,18 @@ def _clumps(parent: Int32) -> tuple[list[tuple[int, int]], list[int]]:
     return clumps, above
 
 
+def _leftmost(numbering: Numbering, node: int) -> int:
+    """Place in the order of the first leaf at or below a node."""
+    while numbering.child_count[node]:
+        node = int(numbering.first_child[node])
+    return int(numbering.nodes[node])
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
 def _fill(begin, below, first_child, child_count, leaf_id, masses, sh, children, rows):  # type: ignore[no-untyped-def]
-    """Rows of the nodes from ``begin`` on, from those of their children, ``below`` ..., or ``sh``."""
+    """Rows of the nodes from ``begin`` on: leaves' from ``sh``, others' from those of their
+    children, which begin with node ``below``.
+    """
     width = rows.shape[1]
     sums = np.empty(width, np.float64)
     last = begin + len(rows) - 1

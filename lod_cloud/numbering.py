@@ -15,10 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from gaussians.lanes import prefetch
 from gaussians.parallel import run_chunks
 from lod_cloud.lod_tree import Float32, Int32
 
-_BLOCK = 1 << 14  # nodes
+BLOCK_NODES = 1 << 14
+_AHEAD = 16  # nodes whose children are on their way from memory
 _MOST_LEVELS = 1024  # 31 of median splits, each with at most 32 merges on a path
 
 
@@ -43,11 +45,13 @@ def number_nodes(children: Int32, root: int, extent: Float32, ratio: float = 1.0
     most = 2 * len(children) + 1
     nodes, parent, first_child, child_count = links = [np.empty(most, np.int32) for _ in range(4)]
     nodes[0], parent[0] = root, -1
+    # side by side, and not read where all nodes are kept
+    extent = np.ascontiguousarray(extent if ratio < 1 else extent[:0])
     offsets, end = [0], 1
     while offsets[-1] < end:
         begin = offsets[-1]
         offsets.append(end)
-        blocks = -(-(end - begin) // _BLOCK)
+        blocks = -(-(end - begin) // BLOCK_NODES)
         counts = np.zeros(blocks + 1, np.int64)  # before the first block: none
         level = begin, end, children, extent, np.float32(ratio), *links
         run_chunks(_expand, blocks, counts, False, *level)
@@ -65,8 +69,19 @@ def number_nodes(children: Int32, root: int, extent: Float32, ratio: float = 1.0
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _expand(  # type: ignore[no-untyped-def]
-    first, last, places, number_them, begin, end, children, extent, ratio,
-    nodes, parent, first_child, child_count,
+    first,
+    last,
+    places,
+    number_them,
+    begin,
+    end,
+    children,
+    extent,
+    ratio,
+    nodes,
+    parent,
+    first_child,
+    child_count,
 ):
     """The children of the nodes in the blocks first..last of the level begin..end.
 
@@ -75,20 +90,28 @@ def _expand(  # type: ignore[no-untyped-def]
     """
     leaves = len(children) + 1
     keeps_all = ratio >= np.float32(1.0)
+    pairs = children.view(np.float32)  # which is what can be asked for
     waiting = np.empty(_MOST_LEVELS, np.int32)
     for block in range(first, last):
         free = places[block] if number_them else 0
-        low = begin + block * _BLOCK
-        for number in range(low, min(low + _BLOCK, end)):
+        low = begin + block * BLOCK_NODES
+        for number in range(low, min(low + BLOCK_NODES, end)):
+            prefetch(pairs, 2 * (np.int64(nodes[min(number + _AHEAD, end - 1)]) - leaves))
             node, before = nodes[number], free
             depth = 0
-            if node >= leaves:
+            if keeps_all and not number_them:
+                free += 2 * np.int64(node >= leaves)
+            elif node >= leaves:
                 waiting[0], waiting[1] = children[node - leaves, 1], children[node - leaves, 0]
                 depth = 2
             while depth:
                 depth -= 1
                 child = waiting[depth]
-                if child < leaves or keeps_all or not extent[child - leaves] > ratio * extent[node - leaves]:
+                if (
+                    child < leaves
+                    or keeps_all
+                    or not extent[child - leaves] > ratio * extent[node - leaves]
+                ):
                     if number_them:
                         nodes[free], parent[free] = child, number
                     free += 1
