@@ -16,6 +16,7 @@ SHARED_SOURCES = (
     "gaussians/lanes.py",
     "lod_cloud/criterion.py",
     "lod_cloud/moments.py",
+    "lod_cloud/nodes.py",
     "lod_cloud/pairing.py",
     "lod_cloud/search/marks.py",
     "lod_cloud/search/prefetching.py",

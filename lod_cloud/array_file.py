@@ -24,7 +24,7 @@ class ArrayFile:
 
     def __init__(self, path: Path, shape: tuple[int, ...], dtype: DTypeLike) -> None:
         self.path, self.dtype = path, np.dtype(dtype)
-        self._width = math.prod(shape[1:])
+        self._shape, self._width = shape[1:], math.prod(shape[1:])
         with path.open("wb") as file:
             header = {
                 "descr": np.lib.format.dtype_to_descr(self.dtype),
@@ -51,8 +51,8 @@ class ArrayFile:
         return rows
 
     def target(self, begin: int, end: int) -> NDArray[Any]:
-        """[end - begin, K] memory that the next ``target`` of this thread overwrites."""
-        return self._buffer("target", end - begin)
+        """[end - begin, ...] memory that the next ``target`` of this thread overwrites."""
+        return self._buffer("target", end - begin).reshape(end - begin, *self._shape)
 
     def write(self, begin: int, rows: NDArray[Any]) -> None:
         """Put rows (of this file's type, in C order) where they belong."""

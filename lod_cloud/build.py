@@ -11,36 +11,42 @@ its mean) and its children's spheres:
     e = max(longest side of the box,  max over children e_ch (1 + 2^-19))
 
 The same scene gives the same bits on any number of threads, in memory and on disk. Memory: about
-250 B per leaf beside scene and result; harmonics pass through in blocks.
+120 B per leaf beside scene and result; harmonics pass through in blocks. Memory that is touched for
+the first time costs a build more than filling it, so arrays are few and small.
 """
 
 from __future__ import annotations
 
+import math
 import os
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from gaussians.constants import OPACITY_LIMIT
 from gaussians.errors import InputError
 from gaussians.parallel import run_chunks
 from gaussians.scene import FIELDS, Scene
-from lod_cloud.array_file import ArrayFile
 from lod_cloud.criterion import LENGTH_LIMIT_M, prove_nesting
-from lod_cloud.harmonics import MemoryRows, Rows, merge_harmonics
+from lod_cloud.harmonics import MemoryRows, merge_harmonics
 from lod_cloud.lod_tree import Int32, LodTree, Point, TreeMetadata
-from lod_cloud.merge import Nodes, merge_leaves
+from lod_cloud.merge import merge_leaves
+from lod_cloud.nodes import FINISHED, Nodes
 from lod_cloud.numbering import Numbering, number_nodes
 from lod_cloud.pairing import MOST_SLOTS
 from lod_cloud.spheres import tighten_spheres
 from lod_cloud.split import split_order
 from lod_cloud.tree_files import TreeWriter
 
+Float64 = NDArray[np.float64]
+
 PAIR_WITHIN = 16
 _CHECKED_ROWS = 1 << 16
 _WRITTEN_ROWS = 1 << 16
+_MAPPED_BYTES = 1 << 29  # of leaves, about, that may stay mapped
 
 
 @dataclass(frozen=True)
@@ -84,17 +90,18 @@ def build_tree(
     Raises InputError for an empty or invalid scene, for coordinates or sizes beyond 1e12 m, and
     where merged opacities exceed 1e6.
     """
-    skeleton = _skeleton(scene, options)
-    numbering, nodes = skeleton.numbering, skeleton.nodes
-    sh = np.empty((len(numbering), *scene.sh.shape[1:]), np.float32)
-    merge_harmonics(
-        numbering, nodes, skeleton.leaf_id, _flat(scene), MemoryRows(sh.reshape(len(sh), -1))
-    )
-    arrays = {}
-    for name in Nodes._fields:
-        source = getattr(nodes, name)
-        arrays[name] = np.empty((len(numbering), *source.shape[1:]), np.float32)
-        run_chunks(_take, len(numbering), numbering.nodes, source, arrays[name])
+    numbering, nodes = _without_harmonics(scene, options, _Mapped(scene))
+    count = len(numbering)
+    arrays = {name: np.empty((count, *shape), np.float32) for name, shape in FINISHED.items()}
+    leaf_id, masses = np.empty(count, np.int32), np.empty(count)
+
+    def finish(begin: int, end: int) -> None:
+        out = tuple(array[begin:end] for array in arrays.values())
+        nodes.finish(begin, end, numbering.nodes, leaf_id, masses, out)
+
+    run_chunks(finish, count)
+    sh = np.empty((count, *scene.sh.shape[1:]), np.float32)
+    merge_harmonics(numbering, masses, leaf_id, _flat(scene), MemoryRows(sh.reshape(count, -1)))
     gaussians = Scene(**{name: arrays[name] for name in FIELDS[:-1]}, sh=sh)
     metadata = TreeMetadata(_bounds(scene), up, units_per_metre, start, path, _record(options))
     return LodTree(
@@ -105,7 +112,7 @@ def build_tree(
         gaussians,
         arrays["radius"],
         arrays["extent"],
-        skeleton.leaf_id,
+        leaf_id,
         metadata,
     )
 
@@ -128,8 +135,8 @@ def build_tree_files(
     its name. Raises as `build_tree` and `save_tree` do, and RuntimeError if the proof failed.
     """
     begin, cpu = time.perf_counter(), os.times().user
-    skeleton = _skeleton(scene, options, release)
-    numbering = skeleton.numbering
+    mapped = _Mapped(scene, release)
+    numbering, nodes = _without_harmonics(scene, options, mapped)
     metadata = TreeMetadata(_bounds(scene), up, units_per_metre, start, path, _record(options))
     counts = {
         "nodes": len(numbering),
@@ -138,16 +145,11 @@ def build_tree_files(
         "sh_degree": scene.sh_degree,
     }
     with TreeWriter(directory, counts, metadata) as writer:
-        for name in ("parent", "first_child", "child_count", "level_offsets"):
-            writer.put(name, getattr(numbering, name))
-        writer.put("leaf_id", skeleton.leaf_id)
-        for name in Nodes._fields:
-            source = getattr(skeleton.nodes, name)
-            file = writer.array(name, (len(numbering), *source.shape[1:]), np.float32)
-            run_chunks(_take_to_file, len(numbering), numbering.nodes, source, file)
-        rows: Rows = writer.array("sh", (len(numbering), *scene.sh.shape[1:]), np.float32)
-        merge_harmonics(numbering, skeleton.nodes, skeleton.leaf_id, _flat(scene), rows, release)
-        del skeleton
+        leaf_id, masses = _write_nodes(writer, numbering, nodes, mapped)
+        del nodes
+        sh = writer.array("sh", (len(numbering), *scene.sh.shape[1:]), np.float32)
+        merge_harmonics(numbering, masses, leaf_id, _flat(scene), sh, mapped.was_read)
+        release()
         cpu_s = os.times().user - cpu
         proof = time.perf_counter()
         violations = prove_nesting(writer.tree())
@@ -158,38 +160,62 @@ def build_tree_files(
     return BuildTimes(time.perf_counter() - begin - disk_s - proof_s, cpu_s, proof_s, disk_s)
 
 
-@dataclass(frozen=True)
-class _Skeleton:
-    """Everything but harmonics."""
+def _write_nodes(
+    writer: TreeWriter, numbering: Numbering, nodes: Nodes, mapped: _Mapped
+) -> tuple[Int32, Float64]:
+    """All arrays of the finished tree but harmonics; returns ids of leaves, and masses."""
+    for name in ("parent", "first_child", "child_count", "level_offsets"):
+        writer.put(name, getattr(numbering, name))
+    count = len(numbering)
+    leaf_id, masses = np.empty(count, np.int32), np.empty(count)
+    files = [writer.array(name, (count, *shape), np.float32) for name, shape in FINISHED.items()]
 
-    numbering: Numbering
-    nodes: Nodes
-    leaf_id: Int32  # [N] id in the scene, -1 for interior nodes
+    def finish(begin: int, end: int) -> None:
+        for low in range(begin, end, _WRITTEN_ROWS):
+            high = min(low + _WRITTEN_ROWS, end)
+            out = tuple(file.target(low, high) for file in files)
+            nodes.finish(low, high, numbering.nodes, leaf_id, masses, out)
+            mapped.was_read((high - low) // 2)
+            for file, rows in zip(files, out, strict=True):
+                file.write(low, rows)
+
+    run_chunks(finish, count)
+    writer.put("leaf_id", leaf_id)
+    return leaf_id, masses
 
 
-def _skeleton(
-    scene: Scene, options: BuildOptions, release: Callable[[], None] = lambda: None
-) -> _Skeleton:
-    _check(scene, release)
+class _Mapped:
+    """Leaves that may be memory-mapped: has them let go of when enough of them were read."""
+
+    def __init__(self, scene: Scene, release: Callable[[], None] = lambda: None) -> None:
+        self._release, self._since, self._lock = release, 0, threading.Lock()
+        widths = (math.prod(getattr(scene, name).shape[1:]) for name in FIELDS)
+        self._most = _MAPPED_BYTES // (4 * sum(widths))
+
+    def was_read(self, leaves: int) -> None:
+        """So many more, by this thread; others may still read theirs."""
+        with self._lock:
+            self._since += leaves
+            if self._since < self._most:
+                return
+            self._since = 0
+        self._release()
+
+
+def _without_harmonics(
+    scene: Scene, options: BuildOptions, mapped: _Mapped
+) -> tuple[Numbering, Nodes]:
+    """The nodes of the unfinished tree and their places in the finished one."""
+    _check(scene, mapped)
     ids = split_order(scene.means, options.pair_within)
-    release()
-    nodes, children = merge_leaves(scene, ids, options.pair_within, release=release)
-    densest = nodes.opacities.max()
-    if not densest <= OPACITY_LIMIT:
-        raise InputError(
-            f"merged opacities must not exceed {OPACITY_LIMIT:g}, not reach {densest:g}: "
-            "too many Gaussians lie on top of each other"
-        )
+    nodes, children = merge_leaves(scene, ids, options.pair_within, was_read=mapped.was_read)
     numbering = number_nodes(children, 2 * len(scene) - 2, nodes.extent, options.fan_out_ratio)
     if options.fan_out_ratio < 1:
         tighten_spheres(numbering, nodes)
-    leaf_id = np.full(len(numbering), -1, np.int32)
-    leaves = np.flatnonzero(numbering.child_count == 0)
-    leaf_id[leaves] = ids[numbering.nodes[leaves]]
-    return _Skeleton(numbering, nodes, leaf_id)
+    return numbering, nodes
 
 
-def _check(scene: Scene, release: Callable[[], None]) -> None:
+def _check(scene: Scene, mapped: _Mapped) -> None:
     """In blocks, which needs little memory; the whole scene only to word the error."""
     if len(scene) == 0:
         raise InputError("a tree needs at least one Gaussian; the scene is empty")
@@ -200,7 +226,7 @@ def _check(scene: Scene, release: Callable[[], None]) -> None:
             rows = slice(low, min(low + _CHECKED_ROWS, end))
             part = Scene(*(getattr(scene, f)[rows] for f in FIELDS)).validate()
             largest = max(largest, float(np.abs(part.means).max()), float(part.scales.max()))
-            release()
+            mapped.was_read(len(part))
         return largest
 
     try:
@@ -233,16 +259,3 @@ def _record(options: BuildOptions) -> dict[str, object]:
 
 def _flat(scene: Scene) -> np.ndarray:
     return scene.sh.reshape(len(scene), -1)
-
-
-def _take_to_file(begin: int, end: int, ids: Int32, source: np.ndarray, file: ArrayFile) -> None:
-    for low in range(begin, end, _WRITTEN_ROWS):
-        high = min(low + _WRITTEN_ROWS, end)
-        rows = file.target(low, high).reshape(-1, *source.shape[1:])
-        np.take(source, ids[low:high], axis=0, out=rows, mode="clip")
-        file.write(low, rows)
-
-
-def _take(begin: int, end: int, ids: Int32, source: np.ndarray, out: np.ndarray) -> None:
-    # mode "clip" writes to ``out`` directly; every id is within the source
-    np.take(source, ids[begin:end], axis=0, out=out[begin:end], mode="clip")

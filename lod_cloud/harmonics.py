@@ -19,14 +19,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from gaussians.lanes import prefetch
 from gaussians.parallel import run_chunks
 from lod_cloud.lod_tree import Float32, Int32
-from lod_cloud.merge import Nodes
-from lod_cloud.moments import surface
 from lod_cloud.numbering import Numbering
 
 _CLUMP = 1 << 15  # nodes
-_RELEASED = 4  # clumps whose leaves may stay mapped
+_AHEAD = 16  # nodes whose leaves are on their way from memory
+_LINE = 16  # numbers in a cache line
 
 
 class Rows(Protocol):
@@ -52,28 +52,29 @@ class MemoryRows:
 
 def merge_harmonics(
     numbering: Numbering,
-    nodes: Nodes,
+    masses: NDArray[np.float64],
     leaf_id: Int32,
     sh: Float32,
     out: Rows,
-    release: Callable[[], None] = lambda: None,
+    was_read: Callable[[int], None] = lambda leaves: None,
 ) -> None:
-    """Fill ``out`` [N, K] from the leaves' coefficients ``sh`` [leaves, K], rows by ``leaf_id``.
+    """Fill ``out`` [N, K] from the leaves' coefficients ``sh`` [leaves, K], rows by ``leaf_id``;
+    ``masses`` [N] are o_i S_i.
 
-    ``release`` is called now and then to let go of what was read of ``sh``.
+    ``was_read`` is told how many more rows of ``sh`` were read.
     """
     clumps, above = _clumps(numbering.parent)
+    # from left to right: neighbours of any level read the same part of ``sh``
+    clumps.sort(key=lambda clump: _leftmost(numbering, clump[0]))
     width = sh.shape[1]
 
     def fill(low: int, high: int, below: int, children: Float32, rows: Float32) -> None:
-        tree = numbering.first_child, numbering.child_count, numbering.nodes, leaf_id
-        _fill(low, below, *tree, nodes.opacities, nodes.scales, sh, children, rows[: high - low])
+        tree = numbering.first_child, numbering.child_count, leaf_id, masses
+        _fill(low, below, *tree, sh, children, rows[: high - low])
 
     def fill_clumps(begin: int, end: int) -> None:
         buffer = np.empty((_CLUMP, width), np.float32)
         for place in range(begin, end):
-            if place % _RELEASED == 0:
-                release()
             ranges = _ranges(numbering.parent, *clumps[place])
             free, below, children = 0, 0, buffer[:0]
             for low, high in reversed(ranges):
@@ -81,6 +82,7 @@ def merge_harmonics(
                 fill(low, high, below, children, rows)
                 out.write(low, rows)
                 free, below, children = free + high - low, low, rows
+            was_read(free // 2)
 
     run_chunks(fill_clumps, len(clumps))
     row = np.empty((1, width), np.float32)
@@ -137,14 +139,26 @@ def _clumps(parent: Int32) -> tuple[list[tuple[int, int]], list[int]]:
     return clumps, above
 
 
+def _leftmost(numbering: Numbering, node: int) -> int:
+    """Place in the order of the first leaf at or below a node."""
+    while numbering.child_count[node]:
+        node = int(numbering.first_child[node])
+    return int(numbering.nodes[node])
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
-def _fill(  # type: ignore[no-untyped-def]
-    begin, below, first_child, child_count, nodes, leaf_id, opacities, scales, sh, children, rows
-):
+def _fill(begin, below, first_child, child_count, leaf_id, masses, sh, children, rows):  # type: ignore[no-untyped-def]
+    """Rows of the nodes from ``begin`` on: leaves' from ``sh``, others' from those of their
+    children, which begin with node ``below``.
+    """
     width = rows.shape[1]
     sums = np.empty(width, np.float64)
+    last = begin + len(rows) - 1
     for row in range(len(rows)):
         node = begin + row
+        ahead = np.int64(leaf_id[min(node + _AHEAD, last)])
+        for line in range(0, width, _LINE):
+            prefetch(sh, ahead * width + line)
         number = child_count[node]
         if number == 0:
             leaf = leaf_id[node]
@@ -154,21 +168,13 @@ def _fill(  # type: ignore[no-untyped-def]
         first = first_child[node]
         total = 0.0
         for child in range(first, first + number):
-            total += _mass(nodes[child], opacities, scales)
+            total += masses[child]
         for k in range(width):
             sums[k] = 0.0
         for child in range(first, first + number):
-            weight = 1.0 / number
-            if total > 0.0:
-                weight = _mass(nodes[child], opacities, scales) / total
+            weight = masses[child] / total if total > 0.0 else 1.0 / number
             values = children[child - below]
             for k in range(width):
                 sums[k] += weight * np.float64(values[k])
         for k in range(width):
             rows[row, k] = np.float32(sums[k])
-
-
-@njit
-def _mass(node, opacities, scales):  # type: ignore[no-untyped-def]
-    """Opacity times surface of a node of the unfinished tree."""
-    return np.float64(opacities[node]) * surface(scales, node)

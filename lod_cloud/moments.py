@@ -24,16 +24,15 @@ _NEGLIGIBLE = 1e-16  # squared ratio of an off-diagonal entry to its diagonal on
 _TINY = 1e-300  # no rotation where nothing is left to turn
 
 
-@njit
+@njit(forceinline=True)
 def rounded_up(value):  # type: ignore[no-untyped-def]
     """Smallest float32 >= value, for finite value >= 0."""
     nearest = np.float32(value)
-    if np.float64(nearest) < value:
-        return np.int32(nearest.view(np.int32) + np.int32(1)).view(np.float32)
-    return nearest
+    step = np.int32(np.float64(nearest) < value)  # without a branch, which is not vectorised
+    return np.int32(nearest.view(np.int32) + step).view(np.float32)
 
 
-@njit
+@njit(forceinline=True)
 def box(xx, yy, zz):  # type: ignore[no-untyped-def]
     """Half diagonal and longest side of the 3-sigma box of a covariance with this diagonal."""
     return 3.0 * math.sqrt(xx + yy + zz), 6.0 * math.sqrt(max(xx, yy, zz))
@@ -49,17 +48,29 @@ def own_box(quaternions, scales, node):  # type: ignore[no-untyped-def]
 @njit
 def around(radius, extent, means, child, above, node, margin):  # type: ignore[no-untyped-def]
     """Least R and e of a node, at ``above[node]``, that hold a child's, at ``means[child]``."""
-    gap = 0.0
-    for axis in range(3):
-        d = np.float64(means[child, axis]) - np.float64(above[node, axis])
-        gap += d * d
-    return (np.float64(radius) + math.sqrt(gap)) * margin, np.float64(extent) * margin
+    dx = np.float64(means[child, 0]) - np.float64(above[node, 0])
+    dy = np.float64(means[child, 1]) - np.float64(above[node, 1])
+    dz = np.float64(means[child, 2]) - np.float64(above[node, 2])
+    return around_at(np.float64(radius), np.float64(extent), dx, dy, dz, margin)
+
+
+@njit(forceinline=True)
+def around_at(radius, extent, dx, dy, dz, margin):  # type: ignore[no-untyped-def]
+    """`around`, of a child so far away."""
+    gap = dx * dx + dy * dy + dz * dz
+    return (radius + math.sqrt(gap)) * margin, extent * margin
 
 
 @njit
 def surface(scales, node):  # type: ignore[no-untyped-def]
     """s0 s1 + s0 s2 + s1 s2, a fixed share of the ellipsoid's silhouette."""
     a, b, c = np.float64(scales[node, 0]), np.float64(scales[node, 1]), np.float64(scales[node, 2])
+    return surface_of(a, b, c)
+
+
+@njit(forceinline=True)
+def surface_of(a, b, c):  # type: ignore[no-untyped-def]
+    """`surface` of these standard deviations."""
     return a * b + a * c + b * c
 
 
@@ -68,10 +79,16 @@ def covariance(quaternions, scales, node):  # type: ignore[no-untyped-def]
     """xx, xy, xz, yy, yz, zz of the node's covariance; the quaternion is normalised."""
     w, x = np.float64(quaternions[node, 0]), np.float64(quaternions[node, 1])
     y, z = np.float64(quaternions[node, 2]), np.float64(quaternions[node, 3])
-    t = 2.0 / (w * w + x * x + y * y + z * z)
     s0 = np.float64(scales[node, 0])
     s1 = np.float64(scales[node, 1])
     s2 = np.float64(scales[node, 2])
+    return covariance_of(w, x, y, z, s0, s1, s2)
+
+
+@njit(forceinline=True)  # a call is not vectorised
+def covariance_of(w, x, y, z, s0, s1, s2):  # type: ignore[no-untyped-def]
+    """`covariance` of this rotation and these standard deviations."""
+    t = 2.0 / (w * w + x * x + y * y + z * z)
     m00 = (1 - t * (y * y + z * z)) * s0
     m10 = t * (x * y + w * z) * s0
     m20 = t * (x * z - w * y) * s0

@@ -13,19 +13,20 @@ from numba import njit
 
 # Moments of a slot, in rows of MOST_SLOTS: first the covariance.
 MOST_SLOTS = 64
-MOMENTS = 14
+MOMENTS = 16
 MEANS = 13  # first rows, those that are weighted means; the mass is a sum
 # unsigned: with signed indices, which might count from the end, nothing is vectorised
 ROW = np.uint64(MOST_SLOTS)
 XX, XY, XZ, YY, YZ, ZZ = (np.uint64(row * MOST_SLOTS) for row in range(6))
 X, Y, Z = (np.uint64(row * MOST_SLOTS) for row in range(6, 9))
 RED, GREEN, BLUE = (np.uint64(row * MOST_SLOTS) for row in range(9, 12))
-OPACITY, MASS = (np.uint64(row * MOST_SLOTS) for row in range(12, 14))
+MEAN_OPACITY, MASS = (np.uint64(row * MOST_SLOTS) for row in range(12, 14))
+RADIUS, EXTENT = (np.uint64(row * MOST_SLOTS) for row in range(14, 16))  # float32 numbers
 
-COSTS_ROW = np.uint64(MOST_SLOTS + 4)  # columns of a row of costs, some spare
+COSTS_ROW = np.uint64(MOST_SLOTS + 8)  # columns of a row of costs, some spare
 _SLOT = np.int64(MOST_SLOTS - 1)  # bits of a cost that hold a slot
 _NEVER = np.int64(0x7FFFFFFFFFFFFF00)  # beyond all costs, with room to add a slot
-_AT_A_TIME = np.uint64(4)  # slots
+_AT_A_TIME = np.uint64(8)  # slots: as many as a vector register holds, and none are left over
 
 
 @njit
@@ -47,8 +48,7 @@ def judge(slot, begin, end, moments, costs):  # type: ignore[no-untyped-def]
     row = np.uint64(slot) * COSTS_ROW
     a = _load(np.uint64(slot), moments)
     low = np.uint64(begin)
-    blocks = (np.uint64(end) - low + _AT_A_TIME - np.uint64(1)) // _AT_A_TIME
-    for i in range(low, low + blocks * _AT_A_TIME):  # up to 3 more, which nothing looks at
+    for i in range(low, low + _whole(np.uint64(end) - low)):  # up to 7 more: nothing looks at them
         costs[row + i] = _cost(a, _load(i, moments), i)
     for i in range(low, np.uint64(end)):
         costs[i * COSTS_ROW + np.uint64(slot)] = (costs[row + i] & ~_SLOT) | np.int64(slot)
@@ -65,9 +65,10 @@ def find_partners(count, costs, partners):  # type: ignore[no-untyped-def]
 @njit
 def cheapest(count, partners):  # type: ignore[no-untyped-def]
     """Two slots, the lower one first, that merge next."""
-    least = _NEVER
-    for slot in range(np.uint64(count)):
-        least = min(least, (partners[slot] & ~_SLOT) | np.int64(slot))
+    least, end = _NEVER, np.uint64(count)
+    for slot in range(_whole(end)):
+        cost = (partners[slot] & ~_SLOT) | np.int64(slot)
+        least = min(least, cost if slot < end else _NEVER)
     low = least & _SLOT
     return low, partners[low] & _SLOT
 
@@ -128,11 +129,17 @@ def restore(kept_numbers, kept_moments, place, at, numbers, moments, costs):  # 
 
 @njit
 def _least(slot, count, costs):  # type: ignore[no-untyped-def]
-    row = np.uint64(slot) * COSTS_ROW
+    row, end = np.uint64(slot) * COSTS_ROW, np.uint64(count)
     least = _NEVER
-    for i in range(row, row + np.uint64(count)):
-        least = min(least, costs[i])
+    for i in range(_whole(end)):
+        least = min(least, costs[row + i] if i < end else _NEVER)
     return least
+
+
+@njit
+def _whole(count):  # type: ignore[no-untyped-def]
+    """At least so many slots, in whole registers."""
+    return (count + _AT_A_TIME - np.uint64(1)) // _AT_A_TIME * _AT_A_TIME
 
 
 @njit

@@ -10,8 +10,8 @@ from numba import njit
 from gaussians.parallel import run_chunks
 from gaussians.scene import Scene
 from lod_cloud.lod_tree import Float32, Int32
-from lod_cloud.merge import Nodes
 from lod_cloud.moments import NEST_MARGIN, around, own_box, rounded_up
+from lod_cloud.nodes import OPACITY, QUATERNION, SCALES, SPHERE, Nodes
 from lod_cloud.numbering import Numbering
 
 
@@ -57,9 +57,11 @@ def tighten_spheres(numbering: Numbering, nodes: Nodes) -> None:
     """
     offsets = numbering.level_offsets
     links = numbering.first_child, numbering.child_count, numbering.nodes
+    scene = nodes.scene
+    leaves = nodes.ids, scene.means, scene.quaternions, scene.scales
     for level in range(len(offsets) - 2, -1, -1):
         begin, end = int(offsets[level]), int(offsets[level + 1])
-        run_chunks(_tighten, end - begin, begin, *links, nodes)
+        run_chunks(_tighten, end - begin, begin, *links, *leaves, nodes.rows)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -83,17 +85,24 @@ def _enclose(parents, below, above):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _tighten(begin, end, offset, first_child, child_count, numbers, nodes):  # type: ignore[no-untyped-def]
-    means, quaternions, scales, _, radius, extent = nodes
-    for row in range(offset + begin, offset + end):
-        if child_count[row] == 0:
+def _tighten(  # type: ignore[no-untyped-def]
+    begin, end, offset, first_child, child_count, numbers, ids, means, quaternions, scales, rows
+):
+    for place in range(offset + begin, offset + end):
+        if child_count[place] == 0:
             continue
-        node = numbers[row]
-        half, side = own_box(quaternions, scales, node)
-        for k in range(first_child[row], first_child[row] + child_count[row]):
+        node = numbers[place] - len(ids)
+        half, side = own_box(rows[:, QUATERNION:SCALES], rows[:, SCALES:OPACITY], node)
+        for k in range(first_child[place], first_child[place] + child_count[place]):
             child = numbers[k]
-            reach, length = around(
-                radius[child], extent[child], means, child, means, node, NEST_MARGIN
-            )
+            if child < len(ids):
+                leaf = ids[child]
+                radius, extent = own_box(quaternions, scales, leaf)
+                radius, extent = rounded_up(radius), rounded_up(extent)
+                reach, length = around(radius, extent, means, leaf, rows, node, NEST_MARGIN)
+            else:
+                child -= len(ids)
+                radius, extent = rows[child, SPHERE], rows[child, SPHERE + 1]
+                reach, length = around(radius, extent, rows, child, rows, node, NEST_MARGIN)
             half, side = max(half, reach), max(side, length)
-        radius[node], extent[node] = rounded_up(half), rounded_up(side)
+        rows[node, SPHERE], rows[node, SPHERE + 1] = rounded_up(half), rounded_up(side)

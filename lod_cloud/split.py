@@ -16,6 +16,9 @@ from lod_cloud.lod_tree import Float32, Int32
 _FILLED_ROWS = 1 << 16
 _MOST_SAMPLES = 63
 _JOINT_LEVELS = 6  # below this level there are enough ranges to split each to the end on its own
+# Places in a point: x, y, z, id. Unsigned: signed indices may count from the end, and are slow.
+_WIDTH, _Y, _Z, _NUMBER = (np.uint64(place) for place in (4, 1, 2, 3))
+_HALVES, _SECOND = np.uint64(2), np.uint64(1)  # the same, as int64
 STACK = 96  # three times the depth of any tree of 2**31 leaves
 
 
@@ -33,8 +36,8 @@ def split_order(means: Float32, group: int) -> Int32:
     the same on any number of threads.
     """
     count = len(means)
-    points = np.empty((count, 4), np.int32)
-    run_chunks(_fill, count, means, points)
+    points = np.empty(4 * count, np.int32)
+    run_chunks(_fill, count, means, points.reshape(count, 4))
     bounds = np.array([0, count], np.int32)
     for _ in range(_JOINT_LEVELS):
         # the first chunk runs alone: an empty range
@@ -43,7 +46,7 @@ def split_order(means: Float32, group: int) -> Int32:
         middles = (low + (high - low) // 2)[high - low > group]
         bounds = np.sort(np.concatenate([bounds, middles]))
     run_chunks(_split_ranges, len(bounds) - 1, bounds, STACK, group, points)
-    return points[:, 3].copy()
+    return points[3::4].copy()
 
 
 def _fill(begin: int, end: int, means: Float32, points: Int32) -> None:
@@ -81,11 +84,13 @@ def _split_ranges(begin, end, bounds, levels, group, points):  # type: ignore[no
 
 @njit
 def _longest_axis(points, low, high):  # type: ignore[no-untyped-def]
-    x0 = x1 = points[low, 0]
-    y0 = y1 = points[low, 1]
-    z0 = z1 = points[low, 2]
-    for i in range(np.uint64(low + 1), np.uint64(high)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+    at = np.uint64(low) * _WIDTH
+    x0 = x1 = points[at]
+    y0 = y1 = points[at + _Y]
+    z0 = z1 = points[at + _Z]
+    for i in range(np.uint64(low), np.uint64(high)):
+        at = i * _WIDTH
+        x, y, z = points[at], points[at + _Y], points[at + _Z]
         x0, x1 = min(x0, x), max(x1, x)
         y0, y1 = min(y0, y), max(y1, y)
         z0, z1 = min(z0, z), max(z1, z)
@@ -113,17 +118,18 @@ def _select(points, axis, low, middle, high, sample):  # type: ignore[no-untyped
     The order is total, so which ones they are does not depend on how this function works. Both
     sides of a pivot are written without a branch, which nobody could predict.
     """
+    halves = points.view(np.int64)  # two move a point
     while low < middle < high:
         pivot = _pivot(points, axis, low, middle, high, sample)
-        place = low
-        for i in range(low, high):
-            x, y, z, number = points[i, 0], points[i, 1], points[i, 2], points[i, 3]
-            key = _key(points, i, axis)
-            for k in range(4):
-                points[i, k] = points[place, k]
-            points[place, 0], points[place, 1] = x, y
-            points[place, 2], points[place, 3] = z, number
-            place += np.int64(key < pivot)
+        free = np.uint64(low)
+        for i in range(np.uint64(low), np.uint64(high)):
+            here, there = i * _HALVES, free * _HALVES
+            first, second = halves[here], halves[here + _SECOND]
+            is_smaller = _key(points, i, axis) < pivot
+            halves[here], halves[here + _SECOND] = halves[there], halves[there + _SECOND]
+            halves[there], halves[there + _SECOND] = first, second
+            free += np.uint64(is_smaller)
+        place = np.int64(free)
         if middle <= place:
             high = place
         else:
@@ -138,7 +144,7 @@ def _pivot(points, axis, low, middle, high, sample):  # type: ignore[no-untyped-
     count = high - low
     size = min(count, 3 if count < 200 else 15 if count < 10_000 else _MOST_SAMPLES)
     for taken in range(size):
-        key = _key(points, low + taken * count // size, axis)
+        key = _key(points, np.uint64(low + taken * count // size), axis)
         place = taken
         while place > 0 and sample[place - 1] > key:
             sample[place] = sample[place - 1]
@@ -147,6 +153,7 @@ def _pivot(points, axis, low, middle, high, sample):  # type: ignore[no-untyped-
     return sample[min(max((middle - low) * size // count, 1), size - 1)]
 
 
-@njit
+@njit(forceinline=True)
 def _key(points, i, axis):  # type: ignore[no-untyped-def]
-    return (np.int64(points[i, axis]) << 32) | np.int64(points[i, 3])
+    at = i * _WIDTH
+    return (np.int64(points[at + np.uint64(axis)]) << 32) | np.int64(points[at + _NUMBER])

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from gaussians.errors import InputError
-from gaussians.parallel import threads
+from gaussians.parallel import run_chunks, threads
 from gaussians.scene import FIELDS, Scene
 from lod_cloud.array_file import ArrayFile
 from lod_cloud.lod_tree import ARRAYS, LodTree, Point, TreeMetadata
@@ -158,7 +158,8 @@ class TreeWriter:
 
     def put(self, name: str, array: NDArray[Any]) -> None:
         """A whole array."""
-        self.array(name, array.shape, array.dtype).write(0, array)
+        file = self.array(name, array.shape, array.dtype)
+        run_chunks(lambda begin, end: file.write(begin, array[begin:end]), len(array))
 
     def tree(self) -> LodTree:
         """What was written so far, memory-mapped; every array must be there."""

@@ -44,6 +44,7 @@ FLOAT64 = {
     "lod_cloud.harmonics": "parents are merged in float64 and rounded once",
     "lod_cloud.merge": "same; sizes are rounded up",
     "lod_cloud.moments": "same",
+    "lod_cloud.nodes": "masses of nodes, and sizes of leaves, rounded up",
     "lod_cloud.pacing_kernels._error": "what is sent first; decides about no node",
     "lod_cloud.pacing_kernels.expand_first": "passes the camera on to it; budgets are float64",
     "lod_cloud.pairing": "costs of merging, and the moments that merge",

@@ -16,7 +16,7 @@ import pytest
 from gaussians import parallel
 from gaussians.errors import InputError
 from gaussians.scene import FIELDS
-from lod_cloud import search_files, tree_files
+from lod_cloud import build, search_files, tree_files
 from lod_cloud.build import BuildOptions, build_tree, build_tree_files
 from lod_cloud.criterion import SearchRequest
 from lod_cloud.leaf_spool import LeafSpool
@@ -269,10 +269,34 @@ def test_a_spool_is_filled_exactly(tmp_path: Path) -> None:
             spool.append(random_scene(6, 2))
 
 
+@pytest.mark.parametrize("most", [1, 100_000, 1 << 29])
+def test_leaves_are_let_go_of_when_enough_were_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int
+) -> None:
+    """In every step and at the end; no release changes a bit."""
+    monkeypatch.setattr(build, "_MAPPED_BYTES", most)
+    scene, released = random_scene(3000, 8), []
+    with LeafSpool(tmp_path, len(scene), 1) as spool:
+        spool.append(scene)
+
+    def release() -> None:
+        spool.release()
+        released.append(spool)
+
+    build_tree_files(spool.scene(), tmp_path / "tree", release=release)
+    read = 4 * 3000 * (11 + 12) * 4  # bytes: checked, merged, finished, and their harmonics
+    assert len(released) <= 1 + read // most
+    assert most > read or len(released) >= 4
+    tree, wanted = load_tree(tmp_path / "tree"), build_tree(scene)
+    for name in FIELDS:
+        assert np.array_equal(getattr(tree.gaussians, name), getattr(wanted.gaussians, name))
+
+
 MEMORY = """
 import sys
 from pathlib import Path
 import numpy as np
+import lod_cloud.build
 from gaussians.parallel import set_threads
 from gaussians.scene import Scene
 from lod_cloud import LeafSpool, SearchRequest, build_tree_files, load_tree
@@ -300,6 +324,7 @@ def search(folder):
     return peak_mb()
 
 set_threads(2)
+lod_cloud.build._MAPPED_BYTES = 1 << 22  # up to so much of the leaves in memory, however many
 folder = Path(sys.argv[1])
 if sys.argv[2] == "build":
     print(build(10_000, folder / "small"), build(200_000, folder / "large"))

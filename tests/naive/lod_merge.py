@@ -57,6 +57,34 @@ def paired_leaf_sets(scene: Scene, ids: list[int], pair_within: int) -> set[froz
     return found
 
 
+def numbering(
+    children: NDArray[np.int32], root: int, extent: NDArray[np.float32], ratio: float
+) -> tuple[list[list[int]], dict[int, int]]:
+    """Levels of node numbers from left to right, and every kept node's parent in the unfinished
+    tree; ``children`` and ``extent`` are those of the interior nodes, which come after the leaves.
+    """
+    leaves = len(children) + 1
+    levels, parents = [[root]], {root: -1}
+
+    def kept_below(node: int, above: int) -> list[int]:
+        found = []
+        for child in children[node - leaves].tolist():
+            large = child >= leaves and (
+                extent[child - leaves] > np.float32(ratio) * extent[above - leaves]
+            )
+            found += kept_below(child, above) if large else [child]
+        return found
+
+    while levels[-1]:
+        below = []
+        for node in levels[-1]:
+            for child in kept_below(node, node) if node >= leaves else []:
+                below.append(child)
+                parents[child] = node
+        levels.append(below)
+    return levels[:-1], parents
+
+
 def _pair_cost(scene: Scene, a: frozenset[int], b: frozenset[int]) -> float:
     both = [merge(scene.take(np.array(sorted(s)))) for s in (a, b)]
     c = merge(scene.take(np.array(sorted(a | b)))).covariance
