@@ -67,7 +67,7 @@ class ByteBudget:
         while True:
             draft = write(choose(self._limit(scale * self.size)))
             filled = len(draft.message) / self.size
-            self._learn(draft)
+            explained = self._learn(draft)
             events = len(draft.portion.expanded) + len(draft.portion.collapsed)
             if filled <= 1:
                 attempts += 1
@@ -82,7 +82,7 @@ class ByteBudget:
             elif attempts:
                 break
             before = events
-            scale *= _MARGIN / filled
+            scale *= _MARGIN / (filled * explained)
         self._scale = min(max(scale, 1 / _SCALE_LIMIT), _SCALE_LIMIT)
         assert best is not None
         return best
@@ -90,9 +90,12 @@ class ByteBudget:
     def _limit(self, size: float) -> Limit:
         return Limit(size, self.per_node + self.per_id, self.per_id)
 
-    def _learn(self, draft: Draft) -> None:
+    def _learn(self, draft: Draft) -> float:
+        """By how much fewer nodes will be chosen because of what this draft has shown."""
+        before = self.per_node + self.per_id
         ids = len(draft.portion.expanded) + len(draft.portion.collapsed)
         if draft.payloads and ids:
             self.per_node = draft.payload_bytes / draft.payloads
             others = (len(draft.message) - draft.payload_bytes) / ids
             self.per_id = max(_LEAST_PER_ID, others)
+        return before / (self.per_node + self.per_id)

@@ -233,13 +233,14 @@ class Client:
                 f"codebook version must be {codec.version:#x}, not ...{delta.codec_hash:08x}"
             )
         table = self.table if delta.base else self.table.emptied()
+        graph = self._subgraph if delta.base else LocalSubgraph(codec.sh_degree)
         self._strayed += 1  # until it is known to be right
         if delta.events is None:
             nodes = codec.decode(delta.payload)
             entered = np.sort(np.concatenate([nodes.ids, delta.reactivated]))
             arrival = _Arrival(entered, delta.removed, nodes, 0)
         else:
-            arrival = self._from_events(delta.events, delta.payload)
+            arrival = self._from_events(delta.events, delta.payload, table, graph)
         arrived = arrival.fresh
         change = _prepared(table, delta, arrival)
         fresh = np.isin(arrived.ids, change.needed, assume_unique=True)
@@ -248,25 +249,28 @@ class Client:
                 f"search {delta.search_index}: must bring exactly what is new"
             )
         self._strayed = 0
-        if delta.base == 0:
-            self._subgraph = LocalSubgraph(codec.sh_degree)
-        self._subgraph.apply(
-            change, arrived if fresh.all() else arrived.take(np.flatnonzero(fresh))
-        )
+        graph.apply(change, arrived if fresh.all() else arrived.take(np.flatnonzero(fresh)))
         table.commit(change)
-        self.table, self.frame, self.applied = table, delta.frame, delta.sequence
+        self.table, self._subgraph = table, graph
+        self.frame, self.applied = delta.frame, delta.sequence
         self._damaged = False
         payloads = len(arrived) - arrival.merged
         return _Applied(change, payloads, arrival.merged, len(arrival.left))
 
-    def _from_events(self, events: Events, payload: bytes) -> _Arrival:
-        assert self._start is not None and self.table is not None
-        codec, graph = self._start.codec, self._subgraph
-        found = outcome(events, self.table, graph, merges=codec.merges)
-        references = graph.means(found.references) if codec.relative else None
+    def _from_events(
+        self, events: Events, payload: bytes, table: ManagementTable, graph: LocalSubgraph
+    ) -> _Arrival:
+        assert self._start is not None
+        codec = self._start.codec
+        found = outcome(events, table, graph, merges=codec.merges)
+        related = codec.relative and len(table) > 0
+        references = graph.means(found.references) if related else None
         arrived = codec.decode(payload, (found.sent, found.sent_parents), references)
         if len(found.merged):
-            arrived = arrived.joined(found.merged).check()
+            arrived = arrived.joined(found.merged)
+        else:
+            arrived = arrived.take(np.argsort(arrived.ids))
+        arrived.check()
         return _Arrival(found.entered, found.left, arrived, len(found.merged))
 
     def _stats(self, size: int, applied: list[_Applied], refused: int = 0) -> ReceiveStats:

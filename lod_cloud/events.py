@@ -57,6 +57,13 @@ class Events:
             unmerged=inner[:0],
         )
 
+    @classmethod
+    def start(cls, tree: LodTree, expanded: Int32) -> Events:
+        """The events that lead from nothing held to a cut: the root is new too."""
+        nothing = expanded[:0]
+        events = cls.of(tree, expanded, nothing)
+        return dataclasses.replace(events, fan_outs=tree.child_count[expanded])
+
     def to_bytes(self, numbers: ChildNumbers) -> bytes:
         """The columns, with their lengths."""
         writer = ColumnWriter()

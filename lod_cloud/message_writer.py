@@ -115,7 +115,8 @@ class MessageWriter:
         table = self.table.emptied()
         change = table.prepare_step(self.search_index, cut, _NOTHING)
         entry = Entry.start(self.sequence + 1, change.state_hash)
-        sets = Sets(0, change, cut, _NOTHING, _NOTHING, _NOTHING, entry)
+        events = Events.start(self.encoder.tree, portion.expanded)
+        sets = Sets(0, change, cut, _NOTHING, _NOTHING, _NOTHING, entry, events)
         return self._written("start", table, sets, portion, len(cut))
 
     def _changed(self, portion: Portion) -> tuple[Int32, Int32]:

@@ -11,6 +11,7 @@ from gaussians.errors import InputError
 from lod_cloud.child_numbers import ChildNumbers
 from lod_cloud.codec import Codec, Encoded, References
 from lod_cloud.cut import without
+from lod_cloud.depth_first import depth_first
 from lod_cloud.events import Events
 from lod_cloud.lod_tree import Int32, LodTree
 from lod_cloud.management_table import ManagementTable
@@ -43,9 +44,7 @@ class TreeEncoder:
         self._known = np.zeros(len(tree), np.bool_)
 
     def encode(self, ids: Int32) -> Encoded:
-        """The nodes ``ids`` (ascending) for a client of which nothing is known; see
-        `Codec.encode`.
-        """
+        """The nodes ``ids`` (ascending) for a client that may hold anything; see `Codec.encode`."""
         return self._coded(ids, None, places=True)
 
     def encode_step(self, events: Events, needed: Int32, table: ManagementTable) -> Encoded:
@@ -56,7 +55,10 @@ class TreeEncoder:
         sent = needed
         if self.codec.merges:
             sent = without(needed, without(events.tops, unmerged))
-        references = self._references(sent, events, table) if self.codec.relative else None
+        above = self.tree.parent[events.expanded]
+        sent = sent[depth_first(sent, self.tree.parent[sent], events.expanded, above)]
+        related = self.codec.relative and len(table) > 0
+        references = self._references(sent, events, table) if related else None
         coded = self._coded(sent, references, places=False)
         events = dataclasses.replace(events, unmerged=unmerged)
         return dataclasses.replace(coded, merged=len(needed) - len(sent), events=events)

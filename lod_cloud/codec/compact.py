@@ -262,7 +262,7 @@ class CompactCodec:
         records = with_rows((ids, parents, child_counts), spheres, gaussians, exact, rows)
         sh = np.concatenate([records.gaussians.sh, above.reshape(count, width // 3, 3)], axis=1)
         scene = dataclasses.replace(records.gaussians, sh=sh)
-        return dataclasses.replace(records, gaussians=scene).check()
+        return dataclasses.replace(records, gaussians=scene)
 
     def _read_harmonics(
         self, reader: ColumnReader, values: dict[str, Column], above: Float32, near: Mask

@@ -86,8 +86,9 @@ class Codec(Protocol):
         places: bool,
         references: References | None = None,
     ) -> Encoded:
-        """Payload of these nodes with their words (see `assign_words`). Without ``places`` ids and
-        parents are left out: the client knows them.
+        """Payload of these nodes, in the order they come in, with their words (see
+        `assign_words`). Without ``places`` ids and parents are left out: the client knows them.
+        With them, ids must ascend.
         """
 
     def decode(

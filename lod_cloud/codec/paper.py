@@ -214,7 +214,7 @@ class PaperCodec:
             spheres[inner, column] = field.decode(reader.plain(np.uint16, int(inner.sum())))
         reader.finish()
         structure = (ids, parents, child_counts)
-        return with_rows(structure, spheres, gaussians, escaped, rows).check()
+        return with_rows(structure, spheres, gaussians, escaped, rows)
 
     def _decode_scene(self, reader: ColumnReader, count: int) -> Scene:
         tile = reader.differences(np.int16, count, 3)

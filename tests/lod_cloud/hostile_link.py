@@ -16,8 +16,10 @@ from lod_cloud.criterion import SearchRequest
 from lod_cloud.cut import is_complete
 from lod_cloud.events import Events
 from lod_cloud.lod_tree import LodTree
+from lod_cloud.management_table import ManagementTable
 from lod_cloud.protocol import RemoteProtocolError
 from lod_cloud.search import SearchTree, make_search
+from lod_cloud.subgraph import LocalSubgraph
 from lod_cloud.tree_encoder import TreeEncoder
 from tests.lod_cloud.trees import random_tree
 
@@ -56,8 +58,10 @@ class CheckedClient(Client):
         super().__init__()
         self.world = where
 
-    def _from_events(self, events: Events, payload: bytes) -> _Arrival:
-        arrival = super()._from_events(events, payload)
+    def _from_events(
+        self, events: Events, payload: bytes, table: ManagementTable, graph: LocalSubgraph
+    ) -> _Arrival:
+        arrival = super()._from_events(events, payload, table, graph)
         merged = np.isin(arrival.fresh.ids, events.tops) & self.world.encoder.codec.merges
         merged &= ~np.isin(arrival.fresh.ids, events.unmerged)
         assert np.count_nonzero(merged) == arrival.merged
