@@ -10,6 +10,7 @@ import numpy as np
 
 from gaussians.errors import InputError
 from gaussians.scene import Scene
+from lod_cloud.codec import Neighbours
 from lod_cloud.criterion import SearchRequest
 from lod_cloud.delta_cut import DeltaCut, Probe, Report, same_codec
 from lod_cloud.events import Events
@@ -264,7 +265,8 @@ class Client:
         codec = self._start.codec
         found = outcome(events, table, graph, merges=codec.merges)
         related = codec.relative and len(table) > 0
-        references = graph.means(found.references) if related else None
+        near = found.references
+        references = Neighbours(near, graph.means(near)) if related else None
         arrived = codec.decode(payload, (found.sent, found.sent_parents), references)
         if len(found.merged):
             arrived = arrived.joined(found.merged)

@@ -95,4 +95,4 @@ class TreeEncoder:
             held[~there & top] = tree.first_child[held[~there & top]]
             held[~there & ~top] = tree.parent[held[~there & ~top]]
         scene = tree.gaussians
-        return References(scene.means[held], scene.scales[held].max(axis=1, initial=0))
+        return References(held, scene.means[held], scene.scales[held].max(axis=1, initial=0))

@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from gaussians.codebook import Codebook
 from gaussians.compression import UInt16
 from gaussians.errors import InputError
-from lod_cloud.codec.interface import Encoded, References
+from lod_cloud.codec.interface import Encoded, Neighbours, References
 from lod_cloud.codec.node_columns import Column, Layout, Rows
 from lod_cloud.codec.node_fields import NodeFields
 from lod_cloud.codec.node_tables import Tables, count_tables, layout_of
@@ -194,7 +194,7 @@ class CompactCodec:
         writer.plain(nodes.float32_rows(np.flatnonzero(exact), coefficients=1))
         writer.positions(np.flatnonzero(~near))
         writer.plain(harmonics(nodes.gaussians, np.flatnonzero(~near)))
-        rows = [Rows.of(inner[some], nodes.parents[some]) for some in (kept, near)]
+        rows = Rows.of(inner, nodes.parents, references.ids if references else None)
         pusher = Pusher()
 
         def push(
@@ -206,7 +206,7 @@ class CompactCodec:
 
         self.layout.pass_through(
             push,
-            rows,
+            (rows.take(kept), rows.take(near)),
             codes.columns(kept, inner, self.layout.colours)
             | self.layout.high_parts(words[near])
             | {"position": choices},
@@ -226,7 +226,7 @@ class CompactCodec:
         self,
         payload: bytes,
         places: tuple[Int32, Int32] | None = None,
-        references: Float32 | None = None,
+        references: Neighbours | None = None,
     ) -> NodeRecords:
         """See `Codec.decode`."""
         reader = ColumnReader(payload)
@@ -242,17 +242,17 @@ class CompactCodec:
         above = np.empty((count, width), np.float32)
         above[far] = reader.plain(np.float32, len(far), width).reshape(len(far), width)
         kept, near = (_all_but(some, count) for some in (exact, far))
-        known = [Rows.of(inner[some], parents[some]) for some in (kept, near)]
+        known = Rows.of(inner, parents, references.ids if references else None)
         puller = Puller(reader)
         values = self.layout.pass_through(
             lambda key, _, contexts, __: puller.column(self.tables[key], contexts),
-            known,
+            (known.take(kept), known.take(near)),
             None,
         )
         puller.finish()
         sigmas = self.fields.sigmas(values)
         choices = values["position"].astype(np.int64)
-        held = None if references is None else references[kept]
+        held = None if references is None else references.means[kept]
         whole = self.fields.position.read(reader, choices, sigmas[:, 0], held)
         gaussians = self.fields.decode(values, sigmas, whole)
         self._read_harmonics(reader, values, above, near)

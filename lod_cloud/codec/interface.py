@@ -18,15 +18,22 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class References:
-    """For each node to be coded, one that the client holds already: as the tree has it."""
+class Neighbours:
+    """For each node to be coded, one that the client holds already: as the client has it."""
 
+    ids: Int32  # [N]
     means: Float32  # [N, 3]
+
+
+@dataclass(frozen=True)
+class References(Neighbours):
+    """The same as the tree has it."""
+
     sigmas: Float32  # [N] largest standard deviation
 
     def take(self, rows: NDArray[np.integer]) -> References:
         """Those of some of the nodes."""
-        return References(self.means[rows], self.sigmas[rows])
+        return References(self.ids[rows], self.means[rows], self.sigmas[rows])
 
 
 @dataclass(frozen=True)
@@ -95,10 +102,10 @@ class Codec(Protocol):
         self,
         payload: bytes,
         places: tuple[Int32, Int32] | None = None,
-        references: Float32 | None = None,
+        references: Neighbours | None = None,
     ) -> NodeRecords:
-        """Inverse of `encode`, given ids and parents where these were left out, and the means
-        [N, 3] of the references as the client has them.
+        """Inverse of `encode`, given ids and parents where these were left out, and the
+        references.
 
         Raises RemoteProtocolError for anything `encode` would not write.
         """

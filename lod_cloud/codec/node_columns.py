@@ -39,11 +39,17 @@ class Rows:
 
     inner: Mask  # not leaves
     siblings: Mask  # child of the same parent as the node before
+    below: Mask  # child of a node that the client holds
 
     @classmethod
-    def of(cls, inner: Mask, parents: Column) -> Rows:
-        """Nodes in the order of their ids."""
-        return cls(inner, np.diff(parents, prepend=-2) == 0)
+    def of(cls, inner: Mask, parents: Column, references: Column | None) -> Rows:
+        """Nodes as they travel, and the nodes held that they may be told from."""
+        below = np.zeros(len(inner), np.bool_) if references is None else references == parents
+        return cls(inner, np.diff(parents, prepend=-2) == 0, below)
+
+    def take(self, some: Mask) -> Rows:
+        """Of some of the nodes; a node that is left out is before others all the same."""
+        return Rows(self.inner[some], self.siblings[some], self.below[some])
 
 
 class _Columns:
@@ -98,7 +104,7 @@ class _Columns:
 
     def position(self) -> None:
         """How the lowest bits of a position are to be read."""
-        self.plain("position", CHOICES, self._place, 4)
+        self.plain("position", CHOICES, self._place + 4 * self._rows.below, 8)
 
     def words(self, symbols: Sequence[int]) -> None:
         """Of the stages of a codebook, each of so many symbols."""
@@ -148,7 +154,7 @@ class Layout:
             return np.empty(0, np.int64)
 
         nothing = np.zeros(0, np.bool_)
-        self.pass_through(note, [Rows(nothing, nothing)] * 2, None)
+        self.pass_through(note, [Rows(nothing, nothing, nothing)] * 2, None)
         return shapes
 
 

@@ -41,7 +41,7 @@ from gaussians.compression import (
 )
 from gaussians.constants import SH_C0
 from gaussians.scene import Scene
-from lod_cloud.codec.interface import Encoded, References
+from lod_cloud.codec.interface import Encoded, Neighbours, References
 from lod_cloud.codec.training import (
     Sample,
     check_words,
@@ -195,7 +195,7 @@ class PaperCodec:
         self,
         payload: bytes,
         places: tuple[Int32, Int32] | None = None,
-        references: Float32 | None = None,
+        references: Neighbours | None = None,
     ) -> NodeRecords:
         """See `Codec.decode`; references are not looked at."""
         reader = ColumnReader(payload)

@@ -17,7 +17,15 @@ from gaussians.codebook import AC_ERROR
 from gaussians.errors import InputError
 from gaussians.scene import FIELDS
 from lod_cloud.build import BuildOptions, build_tree
-from lod_cloud.codec import CompactCodec, Encoded, References, compact, read_codec, training
+from lod_cloud.codec import (
+    CompactCodec,
+    Encoded,
+    Neighbours,
+    References,
+    compact,
+    read_codec,
+    training,
+)
 from lod_cloud.codec.axes import sorted_axes
 from lod_cloud.codec.rans import Frequencies
 from lod_cloud.codec.tolerance import CODED_MASS_ERROR
@@ -102,7 +110,9 @@ def test_any_reference_within_the_tolerance_gives_the_same_bits(seed: int, bits:
     right = coded(tree, codec, ids)[0].gaussians
     near = rng.integers(0, len(tree), len(tree))  # any node will do
     scene = tree.gaussians
-    references = References(scene.means[near], scene.scales[near].max(axis=1))
+    references = References(
+        near.astype(np.int32), scene.means[near], scene.scales[near].max(axis=1)
+    )
     nodes = NodeRecords.of(tree, ids)
     words, good = codec.assign_words(tree, ids)
     sent = codec.encode(nodes, words, good, places=False, references=references)
@@ -110,7 +120,9 @@ def test_any_reference_within_the_tolerance_gives_the_same_bits(seed: int, bits:
     moved = references.means + share * codec.tolerance * references.sigmas[:, None]
     towards = np.where(share < 0, np.inf, -np.inf)
     clients = np.nextafter(moved.astype(np.float32), towards.astype(np.float32))
-    got = codec.decode(sent.payload, (ids, tree.parent), clients).gaussians
+    got = codec.decode(
+        sent.payload, (ids, tree.parent), Neighbours(references.ids, clients)
+    ).gaussians
     for name in FIELDS:
         assert np.array_equal(getattr(got, name), getattr(right, name))
     assert encoder.codec is codec
