@@ -69,18 +69,16 @@ class CountingEncoder(TreeEncoder):
         self.columns: Counter[str] = Counter()
         self.event_bytes, self.cpu_s = 0, 0.0
 
-    def encode(self, ids: Int32) -> Encoded:
-        return super().encode(ids) if self.counting else NOTHING_CODED
-
-    def encode_step(self, events: Events, needed: Int32, table: ManagementTable) -> Encoded:
+    def encode_step(
+        self, events: Events, sent: Int32, table: ManagementTable, *, plain: bool = False
+    ) -> Encoded:
         if not self.counting:
-            return dataclasses.replace(NOTHING_CODED, events=events)
+            return NOTHING_CODED
         begin = time.process_time()
-        coded = super().encode_step(events, needed, table)
+        coded = super().encode_step(events, sent, table, plain=plain)
         self.cpu_s += time.process_time() - begin
-        assert coded.events is not None
         self.columns.update(coded.columns)
-        self.event_bytes += len(coded.events.to_bytes(self.child_numbers))
+        self.event_bytes += len(events.to_bytes(self.child_numbers))
         return coded
 
 

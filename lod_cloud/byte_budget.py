@@ -31,6 +31,8 @@ class ByteBudget:
             raise InputError(f"the byte budget must be at least 1 B, not {size}")
         self.size = size
         self.per_node, self.per_id = 32.0, 2.0  # before anything was sent
+        self.per_completed = 8.0  # bytes of a node's harmonics
+        self.raised = False  # whether the newest request was for a larger tau than asked for
         self._scale = 1.0  # of what both say
 
     def request(self, request: SearchRequest, last: SearchStats | None) -> SearchRequest:
@@ -40,13 +42,11 @@ class ByteBudget:
         that tau takes the place of a smaller one until the client has all that it asks for: what
         is finer cannot be sent before, so searching for it would only take time.
         """
-        if request.tau_px >= RAISED_TAU_PX:
-            return request
         raised = last is not None and last.tau_px >= RAISED_TAU_PX
         near_enough = 0.0 if raised else 2 * RAISED_TAU_PX
-        if last is None or last.pending_error_px > near_enough:
-            return replace(request, tau_px=RAISED_TAU_PX)
-        return request
+        behind = last is None or last.pending_error_px > near_enough
+        self.raised = behind and request.tau_px < RAISED_TAU_PX
+        return replace(request, tau_px=RAISED_TAU_PX) if self.raised else request
 
     def may_fit(self, nodes: int) -> bool:
         """Whether a message about so many nodes is worth writing at a venture."""
@@ -86,6 +86,25 @@ class ByteBudget:
         self._scale = min(max(scale, 1 / _SCALE_LIMIT), _SCALE_LIMIT)
         assert best is not None
         return best
+
+    def fill(self, draft: Draft, write: Callable[[int], Draft], waiting: int) -> Draft:
+        """``draft``, or one that says the same and completes as many of the nodes ``waiting`` for
+        their harmonics as fit; at least one if it says nothing else.
+        """
+        best, room = draft, self.size - len(draft.message)
+        for _ in range(_ATTEMPTS if waiting else 0):
+            count = min(waiting, int(_MARGIN * room / self.per_completed))
+            if count <= 0:
+                break
+            fuller = write(count)
+            more = len(fuller.message) - len(draft.message)
+            self.per_completed = more / count
+            if more <= room and len(fuller.message) > len(best.message):
+                best = fuller
+            if more <= room and (count == waiting or more >= _FULL * room):
+                break
+        silent = not draft.added and not draft.portion.collapsed.size
+        return write(1) if waiting and silent and best is draft else best
 
     def _limit(self, size: float) -> Limit:
         return Limit(size, self.per_node + self.per_id, self.per_id)

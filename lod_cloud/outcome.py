@@ -89,7 +89,7 @@ def outcome(
         sent[order],
         above[order],
         near[order],
-        families.merged(merged, wanted_parents[~apart], held),
+        families.merged(merged, wanted_parents[~apart], held, table),
     )
 
 
@@ -107,7 +107,7 @@ def _parents_if_any(ids: Int32, nodes: Int32, parents: Int32) -> Int32:
 
 
 def _ancestors(ids: Int32, nodes: Int32, parents: Int32, table: ManagementTable) -> Int32:
-    """The nearest ancestor held of each of ``ids``, which are some of ``nodes``; -1 where none is."""
+    """The nearest ancestor held of each of ``ids``, some of ``nodes``; -1 if nothing is held."""
     if not len(table):
         return np.full(len(ids), -1, np.int32)
     near = _parents(ids, nodes, parents)

@@ -106,11 +106,6 @@ class _Columns:
         """How the lowest bits of a position are to be read."""
         self.plain("position", CHOICES, self._place + 4 * self._rows.below, 8)
 
-    def words(self, symbols: Sequence[int]) -> None:
-        """Of the stages of a codebook, each of so many symbols."""
-        for stage, count in enumerate(symbols):
-            self.plain(f"harmonics.{stage}", count, self._inner, 2)
-
 
 @dataclass(frozen=True)
 class Layout:
@@ -130,20 +125,27 @@ class Layout:
         """What of words [N, stages] are symbols."""
         return {f"harmonics.{i}": words[:, i] >> low for i, (_, low) in enumerate(self.words)}
 
-    def pass_through(
-        self,
-        code: Coder,
-        rows: Sequence[Rows],
-        given: Mapping[str, Column] | None,
+    def fields(
+        self, code: Coder, rows: Rows, given: Mapping[str, Column] | None
     ) -> dict[str, Column]:
-        """All columns: of the nodes whose fields are coded, and of those whose harmonics are."""
-        fields, harmonics = (_Columns(code, some, given) for some in rows)
-        fields.shape()
-        fields.look(self.colours)
-        fields.spheres()
-        fields.position()
-        harmonics.words([symbols for symbols, _ in self.words])
-        return fields.values | harmonics.values
+        """All columns of nodes but those of the harmonics above degree 0."""
+        columns = _Columns(code, rows, given)
+        columns.shape()
+        columns.look(self.colours)
+        columns.spheres()
+        columns.position()
+        return columns.values
+
+    def harmonics(
+        self, code: Coder, inner: Mask, given: Mapping[str, Column] | None
+    ) -> dict[str, Column]:
+        """Words of nodes, one column for each stage of the codebook."""
+        values = {}
+        for stage, (symbols, _) in enumerate(self.words):
+            key = f"harmonics.{stage}"
+            known = None if given is None else given[key]
+            values[key] = code(key, (2, symbols), inner.astype(np.int64), known)
+        return values
 
     def shapes(self) -> dict[str, tuple[int, int]]:
         """Number of contexts and of symbols of every column."""
@@ -154,7 +156,8 @@ class Layout:
             return np.empty(0, np.int64)
 
         nothing = np.zeros(0, np.bool_)
-        self.pass_through(note, [Rows(nothing, nothing, nothing)] * 2, None)
+        self.fields(note, Rows(nothing, nothing, nothing), None)
+        self.harmonics(note, nothing, None)
         return shapes
 
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from gaussians.codebook import Codebook
 from lod_cloud.codec.interface import References
-from lod_cloud.codec.node_columns import Column, Layout, Rows
+from lod_cloud.codec.node_columns import Coder, Column, Layout, Rows
 from lod_cloud.codec.node_fields import NodeFields
-from lod_cloud.codec.rans import Frequencies
+from lod_cloud.codec.rans import Frequencies, Puller, Pusher
 from lod_cloud.codec.training import words_of
 from lod_cloud.lod_tree import Int32, LodTree
 from lod_cloud.node_records import NodeRecords
@@ -23,6 +23,22 @@ _LEVELS_UP = (0, 1, 2, 4)  # from one to the next: parent, grandparent and so on
 def layout_of(fields: NodeFields, codebook: Codebook | None) -> Layout:
     """The columns of a codec with these fields and this codebook."""
     return Layout.of(fields.dc.top + 1, [len(book) for book in codebook.stages] if codebook else [])
+
+
+def pushing(pusher: Pusher, tables: Tables) -> Coder:
+    """What columns go through to be sent."""
+
+    def push(key: str, _: tuple[int, int], contexts: Column, values: Column | None, /) -> Column:
+        assert values is not None
+        pusher.add(key.split(".")[0], tables[key], values, contexts)
+        return values
+
+    return push
+
+
+def pulling(puller: Puller, tables: Tables) -> Coder:
+    """What columns come from."""
+    return lambda key, _, contexts, __: puller.column(tables[key], contexts)
 
 
 def count_tables(
@@ -56,9 +72,8 @@ def count_tables(
         tables[key] = Frequencies.counted(values, contexts, shape)
         return values
 
-    layout.pass_through(
-        count, (rows[0].take(kept), rows[0].take(near)), given | {"position": choices}
-    )
+    layout.fields(count, rows[0].take(kept), given | {"position": choices})
+    layout.harmonics(count, inner[near], given)
     return tables
 
 

@@ -96,6 +96,11 @@ class PaperCodec:
         )
 
     @property
+    def apart(self) -> None:
+        """The paper's coding is one word per node: nothing is sent without it."""
+        return None
+
+    @property
     def merges(self) -> bool:
         """Everything is sent."""
         return False
@@ -155,8 +160,9 @@ class PaperCodec:
         *,
         places: bool,
         references: References | None = None,
+        plain: bool = False,
     ) -> Encoded:
-        """See `Codec.encode`; references are not looked at."""
+        """See `Codec.encode`; references are not looked at, and nothing is ever plain."""
         scene = nodes.gaussians
         tile, offset, valid = self.position.encode(scene.means)
         scale, scale_valid = self.scale.encode(scene.scales)
@@ -196,8 +202,10 @@ class PaperCodec:
         payload: bytes,
         places: tuple[Int32, Int32] | None = None,
         references: Neighbours | None = None,
+        *,
+        plain: bool = False,
     ) -> NodeRecords:
-        """See `Codec.decode`; references are not looked at."""
+        """See `Codec.decode`; references are not looked at, and nothing is ever plain."""
         reader = ColumnReader(payload)
         ids, parents = read_places(reader, places)
         count = len(ids)

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from gaussians.scene import FIELDS, Scene
 from lod_cloud.client import Client, _Arrival
@@ -14,8 +15,9 @@ from lod_cloud.cloud import Cloud
 from lod_cloud.codec import Codec, CompactCodec, PaperCodec
 from lod_cloud.criterion import SearchRequest
 from lod_cloud.cut import is_complete
+from lod_cloud.delta_cut import DeltaCut
 from lod_cloud.events import Events
-from lod_cloud.lod_tree import LodTree
+from lod_cloud.lod_tree import Int32, LodTree
 from lod_cloud.management_table import ManagementTable
 from lod_cloud.protocol import RemoteProtocolError
 from lod_cloud.search import SearchTree, make_search
@@ -38,6 +40,13 @@ class World:
     decoded: Scene  # what a client must have for every node
     places: list[SearchRequest]
 
+    def values(self, ids: Int32, plain: NDArray[np.bool_]) -> Scene:
+        """What a client must have of nodes that it was sent, and holds plain or complete."""
+        scene = self.decoded.take(ids)
+        sh = np.where(plain[:, None, None], 0, scene.sh)
+        sh[:, 0] = scene.sh[:, 0]
+        return dataclasses.replace(scene, sh=sh)
+
 
 @cache
 def world(leaves: int, seed: int, codebook: int = 1, *, compact: bool = False) -> World:
@@ -59,16 +68,17 @@ class CheckedClient(Client):
         self.world = where
 
     def _from_events(
-        self, events: Events, payload: bytes, table: ManagementTable, graph: LocalSubgraph
+        self, events: Events, delta: DeltaCut, table: ManagementTable, graph: LocalSubgraph
     ) -> _Arrival:
-        arrival = super()._from_events(events, payload, table, graph)
+        arrival = super()._from_events(events, delta, table, graph)
         merged = np.isin(arrival.fresh.ids, events.tops) & self.world.encoder.codec.merges
         merged &= ~np.isin(arrival.fresh.ids, events.unmerged)
         assert np.count_nonzero(merged) == arrival.merged
         sent = arrival.fresh.take(np.flatnonzero(~merged))
+        assert np.array_equal(arrival.sent, sent.ids)
+        right = self.world.values(sent.ids, np.full(len(sent), delta.plain))
         for name in FIELDS:
-            right = getattr(self.world.decoded, name)[sent.ids]
-            assert np.array_equal(getattr(sent.gaussians, name), right)
+            assert np.array_equal(getattr(sent.gaussians, name), getattr(right, name))
         return arrival
 
 
@@ -103,7 +113,9 @@ class HostilePair:
         self._budget = budget
         self._place, self._frame = PLACES // 2, 0
         nothing = np.empty(0, np.int32)
-        self._states = {0: (nothing, nothing, 0)}  # of the cloud's table, by sequence number
+        # of the cloud's table, by sequence number
+        self._states = {0: (nothing, nothing, nothing.astype(np.bool_), 0)}
+        self.plain = self.completed = 0  # nodes of messages sent
 
     def act(self, action: Action) -> None:
         """One event: a search, or something that happens to what is underway."""
@@ -138,11 +150,11 @@ class HostilePair:
         assert self.cloud.stats is not None
         tau_px = self.world.places[self._place].tau_px
         pending = [self.cloud.stats.pending]
-        while pending[-1] or self.cloud.stats.tau_px > tau_px:
+        while pending[-1] or self.cloud.stats.tau_px > tau_px or self.cloud.stats.pending_harmonics:
             self._search()
             self._deliver_all()
             pending.append(self.cloud.stats.pending)
-            assert len(pending) <= 2 * len(self.world.tree)
+            assert len(pending) <= 3 * len(self.world.tree)
         return pending
 
     def _deliver_all(self) -> None:
@@ -174,7 +186,13 @@ class HostilePair:
         if self._budget is not None and len(message) > self._budget:
             events = stats.added + stats.removed
             assert stats.kind != "step" or events <= 1 + self.world.tree.child_count.max()
-        self._states[self.cloud.sequence] = table.ids, table.last, table.state_hash
+            assert stats.completed == 0 or (stats.completed, events) == (1, 0)
+        plain = table.plain(table.ids)
+        bare = np.count_nonzero(plain & table.in_cut(table.ids))
+        assert stats.pending_harmonics == table.plain_in_cut == bare
+        assert not plain.any() or self._budget is not None
+        self.plain, self.completed = self.plain + stats.plain, self.completed + stats.completed
+        self._states[self.cloud.sequence] = table.ids, table.last, plain, table.state_hash
         self.down.append(message)
 
     def _down(self, which: int) -> None:
@@ -248,21 +266,26 @@ class HostilePair:
         """The client holds what the cloud's table held after the message it applied last."""
         table, graph = self.client.table, self.client._subgraph
         assert table is not None
-        ids, last, state_hash = self._states[self.client.applied]
+        ids, last, plain, state_hash = self._states[self.client.applied]
         assert np.array_equal(table.ids, ids)
         assert np.array_equal(table.last, last)
+        assert np.array_equal(table.plain(ids), plain)
         assert table.state_hash == state_hash
         assert len(table) == len(ids)
         assert np.array_equal(graph.ids, ids)
         assert np.array_equal(graph._parents, self.world.tree.parent[ids])
         assert np.array_equal(graph._child_counts, self.world.tree.child_count[ids])
-        held, right = graph.gaussians(np.arange(len(ids), dtype=np.int32)), self.world.decoded
+        held, right = (
+            graph.gaussians(np.arange(len(ids), dtype=np.int32)),
+            self.world.values(ids, plain),
+        )
         same = np.ones(len(ids), np.bool_)
         for name in FIELDS:
-            equal = getattr(held, name) == getattr(right, name)[ids]
+            equal = getattr(held, name) == getattr(right, name)
             same &= equal.all(axis=tuple(range(1, equal.ndim)))
         self.merged += int(np.count_nonzero(~same))
         codec, true = self.world.encoder.codec, self.world.tree.gaussians.take(ids[~same])
+        assert not held.sh[plain, 1:].any()
         if not codec.merges:
             assert same.all()
         elif not same.all():  # merged by the client
