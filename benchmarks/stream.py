@@ -204,6 +204,10 @@ def loss(
         leaves_db = pictures.psnr_db(decoded, pictures.full)
         print(f"  decoded against the cut       {_in_words(cut_db)}")
         print(f"  decoded against all leaves    {_in_words(leaves_db)}")
+        if codec.apart:
+            bare = [_plain(scene) for scene in decoded]
+            print(f"  the same without harmonics    {pictures.score(bare, images)}")
+            print(f"    against all leaves          {pictures.score(bare, pictures.full)}")
         rows[name] = {
             "decoded_vs_cut_db": float(np.mean(cut_db)),
             "decoded_vs_leaves_db": float(np.mean(leaves_db)),
@@ -236,6 +240,13 @@ FIELDS = {
     "harmonics": ("above",),
     "all but harmonics": ("means", "scales", "quaternions", "opacities", "dc"),
 }
+
+
+def _plain(scene: Scene) -> Scene:
+    """As nodes come while tau is raised."""
+    sh = scene.sh.copy()
+    sh[:, 1:] = 0
+    return dataclasses.replace(scene, sh=sh)
 
 
 def _mixed(original: Scene, decoded: Scene, fields: Sequence[str], *, sorted_first: bool) -> Scene:

@@ -51,7 +51,7 @@ UNACKNOWLEDGED_NODES = 1 << 19  # 2 MiB; more would be nearly as good as a whole
 class Cloud:
     """Serves one client: one search every ``frames_per_search`` frames, one message per search.
 
-    Memory per client, whether it answers or not: the state of its search, a bit and a byte per
+    Memory per client, whether it answers or not: the state of its search, two bits and a byte per
     node of the tree and at most 8 B per node held (`ManagementTable`), and 4 MiB of what is
     unacknowledged; see `state_bytes`. At 5 M leaves, a cut of 1.7 M nodes and `auto`: 38 MB
     measured on a walk (27 of them the search's) and after teleports with 2.1 M nodes held, at most
