@@ -13,7 +13,6 @@ from gaussians.scene import Scene
 from lod_cloud.codec import Neighbours
 from lod_cloud.criterion import SearchRequest
 from lod_cloud.delta_cut import DeltaCut, Probe, Report, same_codec
-from lod_cloud.events import Events
 from lod_cloud.lod_tree import Float32, Int32
 from lod_cloud.management_table import ManagementTable, TableChange
 from lod_cloud.node_records import NodeRecords
@@ -247,7 +246,7 @@ class Client:
             entered = np.sort(np.concatenate([nodes.ids, delta.reactivated]))
             arrival = _Arrival(entered, delta.removed, nodes, nodes.ids, 0)
         else:
-            arrival = self._from_events(delta.events, delta, table, graph)
+            arrival = self._from_events(delta, table, graph)
         arrived = arrival.fresh
         completed, above = self._completed(delta, arrival.left, table, graph)
         change = _prepared(table, delta, arrival, completed)
@@ -289,11 +288,11 @@ class Client:
         return nodes, apart.decode(delta.harmonics, graph.child_counts(nodes) > 0)
 
     def _from_events(
-        self, events: Events, delta: DeltaCut, table: ManagementTable, graph: LocalSubgraph
+        self, delta: DeltaCut, table: ManagementTable, graph: LocalSubgraph
     ) -> _Arrival:
-        assert self._start is not None
+        assert self._start is not None and delta.events is not None
         codec = self._start.codec
-        found = outcome(events, table, graph, merges=codec.merges)
+        found = outcome(delta.events, table, graph, merges=codec.merges)
         related = codec.relative and len(table) > 0
         near = found.references
         references = Neighbours(near, graph.means(near)) if related else None

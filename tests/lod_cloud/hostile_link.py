@@ -16,7 +16,6 @@ from lod_cloud.codec import Codec, CompactCodec, PaperCodec
 from lod_cloud.criterion import SearchRequest
 from lod_cloud.cut import is_complete
 from lod_cloud.delta_cut import DeltaCut
-from lod_cloud.events import Events
 from lod_cloud.lod_tree import Int32, LodTree
 from lod_cloud.management_table import ManagementTable
 from lod_cloud.protocol import RemoteProtocolError
@@ -68,9 +67,10 @@ class CheckedClient(Client):
         self.world = where
 
     def _from_events(
-        self, events: Events, delta: DeltaCut, table: ManagementTable, graph: LocalSubgraph
+        self, delta: DeltaCut, table: ManagementTable, graph: LocalSubgraph
     ) -> _Arrival:
-        arrival = super()._from_events(events, delta, table, graph)
+        arrival, events = super()._from_events(delta, table, graph), delta.events
+        assert events is not None
         merged = np.isin(arrival.fresh.ids, events.tops) & self.world.encoder.codec.merges
         merged &= ~np.isin(arrival.fresh.ids, events.unmerged)
         assert np.count_nonzero(merged) == arrival.merged

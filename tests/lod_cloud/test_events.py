@@ -38,9 +38,9 @@ def test_tops_are_the_collapsed_nodes_that_are_drawn(leaves: int, seed: int) -> 
         before = cut
 
 
-def talking(where: World) -> tuple[Cloud, Client]:
+def talking(where: World, budget: int | None = None) -> tuple[Cloud, Client]:
     """A session after a few searches."""
-    cloud, client = Cloud(where.tree, where.encoder), Client()
+    cloud, client = Cloud(where.tree, where.encoder, budget_bytes=budget), Client()
     client.receive(cloud.session_start())
     for frame, place in enumerate((20, 21, 24, 23)):
         client.receive(cloud.search(where.places[place], frame))
@@ -133,12 +133,22 @@ def test_strange_events_never_lead_astray(
     assert client.table.state_hash == cloud.table.state_hash
 
 
-@given(st.integers(0, PLACES - 1), st.integers(0, 4000), st.integers(1, 255), st.booleans())
-@settings(max_examples=100)
-def test_strange_bytes_never_lead_astray(place: int, at: int, flip: int, compact: bool) -> None:
-    """A message with a right checksum around wrong bytes: refused, or the same nodes."""
+@given(
+    st.integers(0, PLACES - 1),
+    st.integers(0, 4000),
+    st.integers(1, 255),
+    st.booleans(),
+    st.sampled_from([None, 300, 500, 900]),
+)
+@settings(max_examples=150)
+def test_strange_bytes_never_lead_astray(
+    place: int, at: int, flip: int, compact: bool, budget: int | None
+) -> None:
+    """A message with a right checksum around wrong bytes: refused, or the same nodes. With a budget
+    some are held plain, or about to be completed.
+    """
     where = world(60, 2, compact=compact)
-    cloud, client = talking(where)
+    cloud, client = talking(where, budget)
     body = bytearray(unseal(cloud.search(where.places[place], 9))[1])
     body[at % len(body)] ^= flip
     assert client.table is not None
