@@ -221,6 +221,29 @@ def test_a_repair_while_tau_is_raised_makes_nodes_plain_again(arrives: bool) -> 
     pair.heal(lose_what_is_underway=False)
 
 
+@pytest.mark.parametrize("arrives", [True, False])
+def test_a_repair_completes_what_was_sent_plain(arrives: bool) -> None:
+    """Tau was raised when two messages were sent, and is not any more when they are made good."""
+    pair = HostilePair(world(400, 2, compact=True), budget=400)
+    pair.act(("walk", 1))
+    pair._deliver_all()
+    pair._search()
+    pair._search()
+    for action in [("down", 1), ("up", 0), ("down" if arrives else "lose_down", 0)]:
+        pair.act(action)
+    pair.up.clear()
+    plain, stats = pair.cloud.table.plain_in_cut, pair.cloud.stats
+    assert stats is not None and stats.plain == stats.payloads > 0
+    pair.cloud.stats = dataclasses.replace(stats, pending_error_px=0.0)
+    pair._search()
+    stats = pair.cloud.stats
+    assert stats is not None and stats.kind == "repair" and stats.plain == 0 < stats.payloads
+    assert 0 < pair.cloud.table.plain_in_cut < plain
+    pair.act(("down", 0))
+    assert pair.client.applied == pair.cloud.sequence
+    pair.heal(lose_what_is_underway=False)
+
+
 def test_completing_changes_what_is_drawn() -> None:
     """The client does not show the copy it made before."""
     pair = completing()
