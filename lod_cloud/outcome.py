@@ -58,13 +58,13 @@ def outcome(
         nodes, parents = np.append(_ROOT, nodes), np.append(_ROOT - 1, parents)
     if (np.diff(nodes) <= 0).any():
         raise RemoteProtocolError("children of different nodes must differ")
-    if (parents >= nodes).any():
-        raise RemoteProtocolError("a parent must have a smaller id than its child")
     drawn = ~np.isin(nodes, events.expanded)
     families = Families.of(events, table, held)
     left = np.union1d(events.expanded[known], families.drawn).astype(np.int32)
     new_tops = ~table.holds(events.tops)
     wanted, wanted_parents = events.tops[new_tops], events.top_parents[new_tops]
+    if (parents >= nodes).any() or (wanted_parents >= wanted).any():
+        raise RemoteProtocolError("a parent must have a smaller id than its child")
     entered = np.concatenate([nodes[drawn], events.tops])
     if len(entered) and not 0 <= entered.min() <= entered.max() < table.nodes:
         raise RemoteProtocolError(f"node ids must be below {table.nodes}")
@@ -78,8 +78,6 @@ def outcome(
     )
     ascending = np.argsort(sent)
     sent, above, near = sent[ascending], above[ascending], near[ascending]
-    if (above >= sent).any():
-        raise RemoteProtocolError("a parent must have a smaller id than its child")
     order = depth_first(
         sent, above, events.expanded, _parents_if_any(events.expanded, nodes, parents)
     )

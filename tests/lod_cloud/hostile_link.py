@@ -59,6 +59,20 @@ def world(leaves: int, seed: int, codebook: int = 1, *, compact: bool = False) -
     return World(tree, SearchTree.of(tree), encoder, decoded, places)
 
 
+def world_of(tree: LodTree, codec: CompactCodec, seed: int) -> World:
+    """The same with a codec of its own and places of a random walk."""
+    encoder = TreeEncoder(tree, codec)
+    everything = encoder.encode(np.arange(len(tree), dtype=np.int32))
+    rng = np.random.default_rng(seed)
+    step, position = rng.uniform(0.1, 1.5), rng.uniform(-5, 5, 3)
+    places = []
+    for _ in range(PLACES):
+        position = position + rng.normal(0, step, 3)
+        places.append(SearchRequest(tuple(position), 200, 6))
+    decoded = codec.decode(everything.payload).gaussians
+    return World(tree, SearchTree.of(tree), encoder, decoded, places)
+
+
 class CheckedClient(Client):
     """A client that knows what should come."""
 
@@ -293,6 +307,15 @@ class HostilePair:
             assert self.world.tree.child_count[ids[~same]].all()
             off = np.abs(held.means[~same].astype(float) - true.means)
             assert (off <= codec.tolerance * true.scales.max(axis=1, keepdims=True)).all()
+
+
+def settled(**changes: object) -> HostilePair:
+    """A session in which one message was applied and acknowledged."""
+    pair = HostilePair(world(60, 2), **changes)  # type: ignore[arg-type]
+    for action in (("walk", 1), ("down", 0), ("down", 0), ("up", 0), ("up", 0)):
+        pair.act(action)
+    assert pair.client.applied == 1
+    return pair
 
 
 FAULTS = (

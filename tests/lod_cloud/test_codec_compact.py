@@ -29,14 +29,11 @@ from lod_cloud.codec import (
 from lod_cloud.codec.axes import sorted_axes
 from lod_cloud.codec.rans import Frequencies
 from lod_cloud.codec.tolerance import CODED_MASS_ERROR
-from lod_cloud.criterion import SearchRequest
-from lod_cloud.delta_cut import DeltaCut
 from lod_cloud.lod_tree import LodTree
 from lod_cloud.node_records import NodeRecords
-from lod_cloud.protocol import DELTA_CUT, RemoteProtocolError, seal, unseal
-from lod_cloud.search import SearchTree
+from lod_cloud.protocol import RemoteProtocolError
 from lod_cloud.tree_encoder import TreeEncoder
-from tests.lod_cloud.hostile_link import HostilePair, World
+from tests.lod_cloud.hostile_link import HostilePair, world_of
 from tests.lod_cloud.trees import random_scene, random_tree
 
 SEEDS = st.integers(0, 999)
@@ -140,19 +137,6 @@ def test_positions_are_told_from_the_node_before_where_nothing_is_held() -> None
     assert together < 8 * len(leaves)
 
 
-def world_of(tree: LodTree, codec: CompactCodec, seed: int) -> World:
-    encoder = TreeEncoder(tree, codec)
-    everything = encoder.encode(np.arange(len(tree), dtype=np.int32))
-    rng = np.random.default_rng(seed)
-    step, position = rng.uniform(0.1, 1.5), rng.uniform(-5, 5, 3)
-    places = []
-    for _ in range(48):
-        position = position + rng.normal(0, step, 3)
-        places.append(SearchRequest(tuple(position), 200, 6))
-    decoded = codec.decode(everything.payload).gaussians
-    return World(tree, SearchTree.of(tree), encoder, decoded, places)
-
-
 @given(
     st.integers(2, 150),
     st.integers(0, 30),
@@ -200,32 +184,6 @@ def test_collapsed_nodes_are_merged_not_sent() -> None:
         merged, payloads = merged + stats.merged, payloads + stats.payloads
     assert merged > 0.15 * payloads
     assert pair.merged > 0
-
-
-def test_what_is_plain_is_not_merged() -> None:
-    """A node that takes the place of plain ones is sent; a client refuses to merge it, whatever
-    else is right.
-    """
-    scene = random_scene(400, 3)
-    scene.scales[:] = np.maximum(scene.scales, 1e-3)
-    scene.opacities[:] = np.maximum(scene.opacities, 0.05)
-    tree = build_tree(scene)
-    codec = CompactCodec.train(tree, 1, words=8)
-    pair = HostilePair(world_of(tree, codec, 3), window=0, budget=300)
-    numbers, refused = pair.world.encoder.child_numbers, 0
-    for step in range(40):
-        pair.act(("teleport", 13 * step))
-        right = DeltaCut.from_bytes(unseal(pair.down[-1])[1], numbers)
-        if right.events is not None and len(right.events.unmerged):
-            events = dataclasses.replace(right.events, unmerged=right.events.unmerged[:0])
-            wrong = dataclasses.replace(right, events=events).to_bytes(numbers)
-            with pytest.raises(RemoteProtocolError) as error:
-                pair.client.receive(seal(DELTA_CUT, wrong))
-            refused += "must not be merged from others without harmonics" in str(error.value)
-        for action in (("down", 0), ("down", 0), ("up", 0)):
-            pair.act(action)  # values are compared
-    assert refused > 0 and pair.merged > 0
-    assert pair.kinds.count("start") == 1
 
 
 def test_interior_nodes_that_are_no_merges_are_sent() -> None:
@@ -346,38 +304,6 @@ def test_frequencies_of_a_session_start_are_checked() -> None:
         read_codec(data.replace(b'"spheres.extent"', b'"spheres.extant"'))
     with pytest.raises(InputError, match="colour bits must be 1 to 10"):
         CompactCodec.train(random_tree(60, 4), 1, words=8, colour_bits=11)
-
-
-@given(st.integers(1, 200), SEEDS, st.booleans())
-@settings(max_examples=25)
-def test_harmonics_apart_make_plain_nodes_complete(count: int, seed: int, far: bool) -> None:
-    """Plain and then completed is what comes complete at once; no byte of harmonics comes twice."""
-    tree = random_tree(count, seed, sh_degree=1)
-    codec = CompactCodec.train(tree, seed, words=16)
-    if far:
-        tree.gaussians.sh[::5, 1:] *= 100.0  # no word is near: float32
-    assert codec.apart is not None
-    encoder, ids = TreeEncoder(tree, codec), np.arange(len(tree), dtype=np.int32)
-    whole, bare = encoder.encode(ids), encoder.encode(ids, plain=True)
-    right, plain = codec.decode(whole.payload), codec.decode(bare.payload, plain=True)
-    for name in FIELDS[:-1]:
-        assert np.array_equal(getattr(plain.gaussians, name), getattr(right.gaussians, name))
-    assert np.array_equal(plain.gaussians.sh[:, 0], right.gaussians.sh[:, 0])
-    assert not plain.gaussians.sh[:, 1:].any() and "harmonics" not in bare.columns
-    later = encoder.encode_harmonics(ids)
-    assert sum(later.columns.values()) == len(later.payload)
-    inner = tree.child_count > 0
-    assert np.array_equal(codec.apart.decode(later.payload, inner), right.gaussians.sh[:, 1:])
-    assert abs(len(bare.payload) + len(later.payload) - len(whole.payload)) <= 8
-    with pytest.raises(RemoteProtocolError):
-        codec.apart.decode(later.payload[:-1], inner)
-    with pytest.raises(RemoteProtocolError):
-        codec.apart.decode(later.payload + b"\0", inner)
-    for position in range(0, len(later.payload), 7):
-        damaged = bytearray(later.payload)
-        damaged[position] ^= 0xFF
-        with contextlib.suppress(RemoteProtocolError):
-            codec.apart.decode(bytes(damaged), inner)
 
 
 @pytest.mark.parametrize("colour_bits", [8, 10])

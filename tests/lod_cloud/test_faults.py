@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,24 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lod_cloud.client import EARLY_MESSAGES
-from lod_cloud.delta_cut import DeltaCut, Report
-from lod_cloud.protocol import DELTA_CUT, REPORT, RemoteProtocolError, seal, unseal
-from tests.lod_cloud.hostile_link import PLACES, Action, HostilePair, schedules, world
+from lod_cloud.delta_cut import Report
+from lod_cloud.protocol import REPORT, RemoteProtocolError, seal
+from tests.lod_cloud.hostile_link import PLACES, Action, HostilePair, schedules, settled, world
 
 LIMITS = ((256, 1 << 20), (256, 1 << 20), (4, 1 << 20), (256, 40), (1, 1))
 WINDOWS = ((4, 32), (1, 3), (4, 0), (2, 7))
 
 
 BUDGETS = (None, None, 1, 250, 600)
-
-
-def settled(**changes: object) -> HostilePair:
-    """A session in which one message was applied and acknowledged."""
-    pair = HostilePair(world(60, 2), **changes)  # type: ignore[arg-type]
-    for action in (("walk", 1), ("down", 0), ("down", 0), ("up", 0), ("up", 0)):
-        pair.act(action)
-    assert pair.client.applied == 1
-    return pair
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,150 +141,6 @@ def test_a_repair_heals_within_a_round_trip_and_a_search_whatever_the_budget() -
     assert pair.client.table.ids.tolist() == pair.cloud.table.ids.tolist()
     pair._deliver_all()
     assert pair.settle()[0] > 0
-
-
-def completing() -> HostilePair:
-    """A session whose client has its cut, some of it still plain; all is acknowledged."""
-    pair = HostilePair(world(400, 2, compact=True), budget=400)
-    pair.act(("walk", 1))
-    pair._deliver_all()
-    while pair.completed == 0:
-        pair._search()
-        pair._deliver_all()
-    assert pair.cloud.table.plain_in_cut > 50
-    return pair
-
-
-def doubtful(*, arrives: bool) -> tuple[HostilePair, int]:
-    """Two messages that complete nodes, and how many; the second comes first, so the client says
-    that something is missing. Then the first comes too, which the cloud does not hear of, or it is
-    lost.
-    """
-    pair = completing()
-    before = pair.cloud.table.plain_in_cut
-    pair._search()
-    pair._search()
-    for action in [("down", 1), ("up", 0), ("down" if arrives else "lose_down", 0)]:
-        pair.act(action)
-    pair.up.clear()
-    assert pair.client.applied == pair.cloud.sequence - 2 * (not arrives)
-    assert before - pair.cloud.table.plain_in_cut > 10
-    return pair, before - pair.cloud.table.plain_in_cut
-
-
-@pytest.mark.parametrize("arrives", [True, False])
-def test_what_may_have_been_completed_is_sent_whole(arrives: bool) -> None:
-    """The repair is right for a client that holds these nodes plain, and for one that has them
-    complete.
-    """
-    pair, done = doubtful(arrives=arrives)
-    plain = pair.cloud.table.plain_in_cut
-    pair._search()
-    stats = pair.cloud.stats
-    assert stats is not None and stats.kind == "repair"
-    assert stats.payloads == done and stats.plain == stats.completed == 0
-    pair.act(("down", 0))  # where values are compared
-    assert pair.client.table is not None and pair.client.applied == pair.cloud.sequence
-    assert pair.client.table.plain_in_cut == pair.cloud.table.plain_in_cut == plain
-    pair.heal(lose_what_is_underway=False)
-    assert pair.kinds.count("start") == 1
-
-
-@pytest.mark.parametrize("arrives", [True, False])
-def test_a_repair_while_tau_is_raised_makes_nodes_plain_again(arrives: bool) -> None:
-    """Much is pending all of a sudden: what the repair sends comes without harmonics, also to a
-    client that has them.
-    """
-    pair, _ = doubtful(arrives=arrives)
-    plain, stats = pair.cloud.table.plain_in_cut, pair.cloud.stats
-    assert stats is not None
-    pair.cloud.stats = dataclasses.replace(stats, pending_error_px=np.inf)
-    pair._search()
-    stats = pair.cloud.stats
-    assert stats is not None and stats.kind == "repair" and stats.tau_px == 30.0
-    assert stats.plain == stats.payloads > 0
-    pair.act(("down", 0))
-    assert pair.client.applied == pair.cloud.sequence
-    if arrives:
-        assert pair.client.table is not None
-        assert pair.client.table.plain(pair.client.table.ids).sum() > plain
-    pair.heal(lose_what_is_underway=False)
-
-
-@pytest.mark.parametrize("arrives", [True, False])
-def test_a_repair_completes_what_was_sent_plain(arrives: bool) -> None:
-    """Tau was raised when two messages were sent, and is not any more when they are made good."""
-    pair = HostilePair(world(400, 2, compact=True), budget=400)
-    pair.act(("walk", 1))
-    pair._deliver_all()
-    pair._search()
-    pair._search()
-    for action in [("down", 1), ("up", 0), ("down" if arrives else "lose_down", 0)]:
-        pair.act(action)
-    pair.up.clear()
-    plain, stats = pair.cloud.table.plain_in_cut, pair.cloud.stats
-    assert stats is not None and stats.plain == stats.payloads > 0
-    pair.cloud.stats = dataclasses.replace(stats, pending_error_px=0.0)
-    pair._search()
-    stats = pair.cloud.stats
-    assert stats is not None and stats.kind == "repair" and stats.plain == 0 < stats.payloads
-    assert 0 < pair.cloud.table.plain_in_cut < plain
-    pair.act(("down", 0))
-    assert pair.client.applied == pair.cloud.sequence
-    pair.heal(lose_what_is_underway=False)
-
-
-def test_completing_changes_what_is_drawn() -> None:
-    """The client does not show the copy it made before."""
-    pair = completing()
-    here = pair.world.places[pair._place]
-    before = pair.client.select(here)
-    pair._search()
-    pair._deliver_all()
-    after = pair.client.select(here)
-    assert np.array_equal(before.node_ids, after.node_ids)
-    assert not np.array_equal(before.scene.sh, after.scene.sh)
-    pair.settle()
-    last = pair.client.select(here)
-    right = pair.world.decoded.take(last.node_ids)
-    assert np.array_equal(last.scene.sh, right.sh)
-
-
-@pytest.mark.parametrize(
-    ("changes", "text"),
-    [
-        ({"completed": 10**6}, "must complete at most the"),
-        ({"harmonics": b""}, "more bytes"),
-        ({"base": 0}, None),
-        ({"completed": 1}, None),
-        ({"completed": 0, "harmonics": b""}, "state hash must be"),
-    ],
-)
-def test_wrong_completions_change_nothing(changes: dict[str, Any], text: str | None) -> None:
-    pair = completing()
-    pair._search()
-    numbers = pair.world.encoder.child_numbers
-    right = DeltaCut.from_bytes(unseal(pair.down[0])[1], numbers)
-    assert right.completed > 1 and pair.client.table is not None
-    before = pair.client.table.state_hash
-    wrong = dataclasses.replace(right, **changes)
-    with pytest.raises(RemoteProtocolError, match=text):
-        pair.client.receive(seal(DELTA_CUT, wrong.to_bytes(numbers)))
-    assert pair.client.table.state_hash == before
-    pair.compare()
-    pair.heal(lose_what_is_underway=False)
-
-
-def test_a_codec_without_layers_refuses_plain_nodes() -> None:
-    pair = settled()
-    pair.act(("walk", 2))
-    numbers = pair.world.encoder.child_numbers
-    right = DeltaCut.from_bytes(unseal(pair.down[0])[1], numbers)
-    for changes in ({"plain": True}, {"completed": 1, "harmonics": b"x"}):
-        wrong = dataclasses.replace(right, **changes)  # type: ignore[arg-type]
-        with pytest.raises(RemoteProtocolError, match="must come with their harmonics"):
-            pair.client.receive(seal(DELTA_CUT, wrong.to_bytes(numbers)))
-    pair.compare()
 
 
 def test_reports_may_be_lost() -> None:
