@@ -16,7 +16,7 @@ _FULL = 0.9  # share of the budget that is worth no further attempt
 _MARGIN = 0.97  # aimed at, so that the next message of the same kind fits
 _ATTEMPTS = 3  # to fill a message that fits
 _SCALE_LIMIT = 64.0
-_LEAST_PER_ID = 0.25  # bytes; neighbouring ids nearly vanish in the entropy coder
+_LEAST = 0.25  # bytes of anything; neighbouring ids nearly vanish in the entropy coder
 
 
 class ByteBudget:
@@ -98,7 +98,7 @@ class ByteBudget:
                 break
             fuller = write(count)
             more = len(fuller.message) - len(draft.message)
-            self.per_completed = more / count
+            self.per_completed = max(_LEAST, more / count)
             if more <= room and len(fuller.message) > len(best.message):
                 best = fuller
             if more <= room and (count == waiting or more >= _FULL * room):
@@ -116,5 +116,5 @@ class ByteBudget:
         if draft.payloads and ids:
             self.per_node = draft.payload_bytes / draft.payloads
             others = (len(draft.message) - draft.payload_bytes) / ids
-            self.per_id = max(_LEAST_PER_ID, others)
+            self.per_id = max(_LEAST, others)
         return before / (self.per_node + self.per_id)
