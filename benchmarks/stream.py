@@ -69,18 +69,16 @@ class CountingEncoder(TreeEncoder):
         self.columns: Counter[str] = Counter()
         self.event_bytes, self.cpu_s = 0, 0.0
 
-    def encode(self, ids: Int32) -> Encoded:
-        return super().encode(ids) if self.counting else NOTHING_CODED
-
-    def encode_step(self, events: Events, needed: Int32, table: ManagementTable) -> Encoded:
+    def encode_step(
+        self, events: Events, sent: Int32, table: ManagementTable, *, plain: bool = False
+    ) -> Encoded:
         if not self.counting:
-            return dataclasses.replace(NOTHING_CODED, events=events)
+            return NOTHING_CODED
         begin = time.process_time()
-        coded = super().encode_step(events, needed, table)
+        coded = super().encode_step(events, sent, table, plain=plain)
         self.cpu_s += time.process_time() - begin
-        assert coded.events is not None
         self.columns.update(coded.columns)
-        self.event_bytes += len(coded.events.to_bytes(self.child_numbers))
+        self.event_bytes += len(events.to_bytes(self.child_numbers))
         return coded
 
 
@@ -206,6 +204,10 @@ def loss(
         leaves_db = pictures.psnr_db(decoded, pictures.full)
         print(f"  decoded against the cut       {_in_words(cut_db)}")
         print(f"  decoded against all leaves    {_in_words(leaves_db)}")
+        if codec.apart:
+            bare = [_plain(scene) for scene in decoded]
+            print(f"  the same without harmonics    {pictures.score(bare, images)}")
+            print(f"    against all leaves          {pictures.score(bare, pictures.full)}")
         rows[name] = {
             "decoded_vs_cut_db": float(np.mean(cut_db)),
             "decoded_vs_leaves_db": float(np.mean(leaves_db)),
@@ -238,6 +240,13 @@ FIELDS = {
     "harmonics": ("above",),
     "all but harmonics": ("means", "scales", "quaternions", "opacities", "dc"),
 }
+
+
+def _plain(scene: Scene) -> Scene:
+    """As nodes come while tau is raised."""
+    sh = scene.sh.copy()
+    sh[:, 1:] = 0
+    return dataclasses.replace(scene, sh=sh)
 
 
 def _mixed(original: Scene, decoded: Scene, fields: Sequence[str], *, sorted_first: bool) -> Scene:

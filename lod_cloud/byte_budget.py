@@ -16,7 +16,7 @@ _FULL = 0.9  # share of the budget that is worth no further attempt
 _MARGIN = 0.97  # aimed at, so that the next message of the same kind fits
 _ATTEMPTS = 3  # to fill a message that fits
 _SCALE_LIMIT = 64.0
-_LEAST_PER_ID = 0.25  # bytes; neighbouring ids nearly vanish in the entropy coder
+_LEAST = 0.25  # bytes of anything; neighbouring ids nearly vanish in the entropy coder
 
 
 class ByteBudget:
@@ -31,6 +31,8 @@ class ByteBudget:
             raise InputError(f"the byte budget must be at least 1 B, not {size}")
         self.size = size
         self.per_node, self.per_id = 32.0, 2.0  # before anything was sent
+        self.per_completed = 8.0  # bytes of a node's harmonics
+        self.raised = False  # whether the newest request was for a larger tau than asked for
         self._scale = 1.0  # of what both say
 
     def request(self, request: SearchRequest, last: SearchStats | None) -> SearchRequest:
@@ -40,13 +42,11 @@ class ByteBudget:
         that tau takes the place of a smaller one until the client has all that it asks for: what
         is finer cannot be sent before, so searching for it would only take time.
         """
-        if request.tau_px >= RAISED_TAU_PX:
-            return request
         raised = last is not None and last.tau_px >= RAISED_TAU_PX
         near_enough = 0.0 if raised else 2 * RAISED_TAU_PX
-        if last is None or last.pending_error_px > near_enough:
-            return replace(request, tau_px=RAISED_TAU_PX)
-        return request
+        behind = last is None or last.pending_error_px > near_enough
+        self.raised = behind and request.tau_px < RAISED_TAU_PX
+        return replace(request, tau_px=RAISED_TAU_PX) if self.raised else request
 
     def may_fit(self, nodes: int) -> bool:
         """Whether a message about so many nodes is worth writing at a venture."""
@@ -67,7 +67,7 @@ class ByteBudget:
         while True:
             draft = write(choose(self._limit(scale * self.size)))
             filled = len(draft.message) / self.size
-            self._learn(draft)
+            explained = self._learn(draft)
             events = len(draft.portion.expanded) + len(draft.portion.collapsed)
             if filled <= 1:
                 attempts += 1
@@ -82,17 +82,39 @@ class ByteBudget:
             elif attempts:
                 break
             before = events
-            scale *= _MARGIN / filled
+            scale *= _MARGIN / (filled * explained)
         self._scale = min(max(scale, 1 / _SCALE_LIMIT), _SCALE_LIMIT)
         assert best is not None
         return best
 
+    def fill(self, draft: Draft, write: Callable[[int], Draft], waiting: int) -> Draft:
+        """``draft``, or one that says the same and completes as many of the nodes ``waiting`` for
+        their harmonics as fit; at least one if it says nothing else.
+        """
+        best, room = draft, self.size - len(draft.message)
+        for _ in range(_ATTEMPTS if waiting else 0):
+            count = min(waiting, int(_MARGIN * room / self.per_completed))
+            if count <= 0:
+                break
+            fuller = write(count)
+            more = len(fuller.message) - len(draft.message)
+            self.per_completed = max(_LEAST, more / count)
+            if more <= room and len(fuller.message) > len(best.message):
+                best = fuller
+            if more <= room and (count == waiting or more >= _FULL * room):
+                break
+        silent = not draft.added and not draft.portion.collapsed.size
+        return write(1) if waiting and silent and best is draft else best
+
     def _limit(self, size: float) -> Limit:
         return Limit(size, self.per_node + self.per_id, self.per_id)
 
-    def _learn(self, draft: Draft) -> None:
+    def _learn(self, draft: Draft) -> float:
+        """By how much fewer nodes will be chosen because of what this draft has shown."""
+        before = self.per_node + self.per_id
         ids = len(draft.portion.expanded) + len(draft.portion.collapsed)
         if draft.payloads and ids:
             self.per_node = draft.payload_bytes / draft.payloads
             others = (len(draft.message) - draft.payload_bytes) / ids
-            self.per_id = max(_LEAST_PER_ID, others)
+            self.per_id = max(_LEAST, others)
+        return before / (self.per_node + self.per_id)

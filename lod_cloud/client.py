@@ -10,10 +10,10 @@ import numpy as np
 
 from gaussians.errors import InputError
 from gaussians.scene import Scene
+from lod_cloud.codec import Neighbours
 from lod_cloud.criterion import SearchRequest
 from lod_cloud.delta_cut import DeltaCut, Probe, Report, same_codec
-from lod_cloud.events import Events
-from lod_cloud.lod_tree import Int32
+from lod_cloud.lod_tree import Float32, Int32
 from lod_cloud.management_table import ManagementTable, TableChange
 from lod_cloud.node_records import NodeRecords
 from lod_cloud.outcome import outcome
@@ -30,6 +30,7 @@ from lod_cloud.protocol import (
 from lod_cloud.session import SessionStart
 from lod_cloud.subgraph import LocalSubgraph
 
+_NOTHING = np.empty(0, np.int32)
 EARLY_MESSAGES = 64  # kept until what they follow arrives
 
 
@@ -39,6 +40,7 @@ class _Applied:
 
     change: TableChange
     payloads: int
+    completed: int
     merged: int
     left: int  # nodes that left the cut
 
@@ -50,6 +52,7 @@ class _Arrival:
     entered: Int32  # the cut; ascending
     left: Int32
     fresh: NodeRecords  # that came or were merged, known before or not
+    sent: Int32  # those that came; ascending
     merged: int
 
 
@@ -64,6 +67,7 @@ class ReceiveStats:
     message_bytes: int
     applied: int  # changes
     payloads: int
+    completed: int  # nodes known before whose harmonics above degree 0 came
     merged: int  # nodes computed from their children instead of sent
     reactivated: int
     removed: int
@@ -228,46 +232,80 @@ class Client:
         codec = self._start.codec
         if delta.frame <= self.frame:
             raise RemoteProtocolError(f"frame must be above {self.frame}, not {delta.frame}")
+        if (delta.plain or delta.completed) and codec.apart is None:
+            raise RemoteProtocolError("nodes of this codec must come with their harmonics")
         if not same_codec(delta.codec_hash, codec.version):
             raise RemoteProtocolError(
                 f"codebook version must be {codec.version:#x}, not ...{delta.codec_hash:08x}"
             )
         table = self.table if delta.base else self.table.emptied()
+        graph = self._subgraph if delta.base else LocalSubgraph(codec.sh_degree)
         self._strayed += 1  # until it is known to be right
         if delta.events is None:
-            nodes = codec.decode(delta.payload)
+            nodes = codec.decode(delta.payload, plain=delta.plain)
             entered = np.sort(np.concatenate([nodes.ids, delta.reactivated]))
-            arrival = _Arrival(entered, delta.removed, nodes, 0)
+            arrival = _Arrival(entered, delta.removed, nodes, nodes.ids, 0)
         else:
-            arrival = self._from_events(delta.events, delta.payload)
+            arrival = self._from_events(delta, table, graph)
         arrived = arrival.fresh
-        change = _prepared(table, delta, arrival)
+        completed, above = self._completed(delta, arrival.left, table, graph)
+        change = _prepared(table, delta, arrival, completed)
         fresh = np.isin(arrived.ids, change.needed, assume_unique=True)
         if delta.base == delta.sequence - 1 and not fresh.all():
             raise RemoteProtocolError(
                 f"search {delta.search_index}: must bring exactly what is new"
             )
         self._strayed = 0
-        if delta.base == 0:
-            self._subgraph = LocalSubgraph(codec.sh_degree)
-        self._subgraph.apply(
-            change, arrived if fresh.all() else arrived.take(np.flatnonzero(fresh))
-        )
+        switched = ~fresh & (table.plain(arrived.ids) != delta.plain)
+        graph.complete(arrived.ids[switched], arrived.gaussians.sh[switched, 1:])
+        if len(completed):
+            graph.complete(completed, above)
+        if switched.any() or len(completed):
+            self._newest = None
+        graph.apply(change, arrived if fresh.all() else arrived.take(np.flatnonzero(fresh)))
         table.commit(change)
-        self.table, self.frame, self.applied = table, delta.frame, delta.sequence
+        self.table, self._subgraph = table, graph
+        self.frame, self.applied = delta.frame, delta.sequence
         self._damaged = False
         payloads = len(arrived) - arrival.merged
-        return _Applied(change, payloads, arrival.merged, len(arrival.left))
+        return _Applied(change, payloads, len(completed), arrival.merged, len(arrival.left))
 
-    def _from_events(self, events: Events, payload: bytes) -> _Arrival:
-        assert self._start is not None and self.table is not None
-        codec, graph = self._start.codec, self._subgraph
-        found = outcome(events, self.table, graph, merges=codec.merges)
-        references = graph.means(found.references) if codec.relative else None
-        arrived = codec.decode(payload, (found.sent, found.sent_parents), references)
+    def _completed(
+        self, delta: DeltaCut, left: Int32, table: ManagementTable, graph: LocalSubgraph
+    ) -> tuple[Int32, Float32]:
+        """Nodes held plain that get their harmonics above degree 0, and these."""
+        assert self._start is not None
+        apart = self._start.codec.apart
+        if apart is None or not delta.completed:
+            return _NOTHING, np.empty((0, 0, 3), np.float32)
+        waiting = table.waiting(left)
+        if delta.base != delta.sequence - 1 or delta.completed > len(waiting):
+            raise RemoteProtocolError(
+                f"search {delta.search_index}: must complete at most the {len(waiting)} nodes that "
+                f"wait for their harmonics, not {delta.completed}"
+            )
+        nodes = waiting[: delta.completed]
+        return nodes, apart.decode(delta.harmonics, graph.child_counts(nodes) > 0)
+
+    def _from_events(
+        self, delta: DeltaCut, table: ManagementTable, graph: LocalSubgraph
+    ) -> _Arrival:
+        assert self._start is not None and delta.events is not None
+        codec = self._start.codec
+        found = outcome(delta.events, table, graph, merges=codec.merges)
+        related = codec.relative and len(table) > 0
+        near = found.references
+        references = Neighbours(near, graph.means(near)) if related else None
+        arrived = codec.decode(
+            delta.payload, (found.sent, found.sent_parents), references, plain=delta.plain
+        )
         if len(found.merged):
-            arrived = arrived.joined(found.merged).check()
-        return _Arrival(found.entered, found.left, arrived, len(found.merged))
+            arrived = arrived.joined(found.merged)
+        else:
+            arrived = arrived.take(np.argsort(arrived.ids))
+        arrived.check()
+        sent = np.sort(found.sent)
+        return _Arrival(found.entered, found.left, arrived, sent, len(found.merged))
 
     def _stats(self, size: int, applied: list[_Applied], refused: int = 0) -> ReceiveStats:
         assert self.table is not None
@@ -277,6 +315,7 @@ class Client:
             message_bytes=size,
             applied=len(applied),
             payloads=sum(one.payloads for one in applied),
+            completed=sum(one.completed for one in applied),
             merged=sum(one.merged for one in applied),
             reactivated=sum(one.change.reactivated for one in applied),
             removed=sum(one.left for one in applied),
@@ -286,11 +325,15 @@ class Client:
         )
 
 
-def _prepared(table: ManagementTable, delta: DeltaCut, arrival: _Arrival) -> TableChange:
+def _prepared(
+    table: ManagementTable, delta: DeltaCut, arrival: _Arrival, completed: Int32
+) -> TableChange:
     """The change that ``delta`` asks for, proved to lead to the cloud's state."""
     index = delta.search_index
+    named = arrival.entered, arrival.left, delta.dropped
+    complete = completed if delta.plain else np.concatenate([arrival.sent, completed])
     try:
-        change = table.prepare(index, arrival.entered, arrival.left, delta.dropped)
+        change = table.prepare(index, *named, arrival.sent if delta.plain else _NOTHING, complete)
     except InputError as error:
         raise RemoteProtocolError(str(error)) from error
     if change.state_hash != delta.state_hash:

@@ -9,8 +9,10 @@ what the client holds, it is a *start*, from nothing. When too much is unacknowl
 
 With a *byte budget* no message is larger, and what does not fit is pending: the client is brought
 to the cut found coarse to fine, near before far (`lod_cloud.pacing`), starting anew from every
-search, so what a jump made useless is never sent. A repair carries again what was underway, which
-may be more.
+search, so what a jump made useless is never sent. While that goes so far that tau is raised
+(`lod_cloud.byte_budget`), nodes are sent *plain*, without their harmonics above degree 0; those
+still in the cut when nothing else is pending are *completed* as the budget allows. A repair carries
+again what was underway, which may be more.
 """
 
 from __future__ import annotations
@@ -49,7 +51,7 @@ UNACKNOWLEDGED_NODES = 1 << 19  # 2 MiB; more would be nearly as good as a whole
 class Cloud:
     """Serves one client: one search every ``frames_per_search`` frames, one message per search.
 
-    Memory per client, whether it answers or not: the state of its search, a bit and a byte per
+    Memory per client, whether it answers or not: the state of its search, two bits and a byte per
     node of the tree and at most 8 B per node held (`ManagementTable`), and 4 MiB of what is
     unacknowledged; see `state_bytes`. At 5 M leaves, a cut of 1.7 M nodes and `auto`: 38 MB
     measured on a walk (27 of them the search's) and after teleports with 2.1 M nodes held, at most
@@ -105,6 +107,7 @@ class Cloud:
         self.found: SearchResult | None = None  # by the newest search
         self.stats: SearchStats | None = None  # of the newest search
         self._client = ClientCut(self._search.tree)  # the table's cut
+        self._apart = self._encoder.codec.apart is not None
         self._level = False  # whether that was the cut found by the search before
         self._journal = Journal(*unacknowledged)
         self._search_index = self._frame = -1
@@ -206,7 +209,15 @@ class Cloud:
             nothing = Limit(0.0, 1.0, 1.0)
             wanted = self._search.refined
             return writer.probe(self._client.first_to(wanted, request, nothing, least=0))
-        return self._fitted(writer.step, found, request, least=1)
+        return self._filled(writer, self._fitted(writer.step, found, request, least=1))
+
+    def _filled(self, writer: MessageWriter, draft: Draft) -> Draft:
+        """The step ``draft``, with harmonics that are missing where nothing else is pending."""
+        budget = self._budget
+        if budget is None or budget.raised or not draft.portion.last:
+            return draft
+        waiting = len(writer.waiting(draft.portion)) if self.table.plain_in_cut else 0
+        return budget.fill(draft, partial(writer.step, draft.portion), waiting)
 
     def _writer(self) -> MessageWriter:
         return MessageWriter(
@@ -218,6 +229,7 @@ class Cloud:
             table=self.table,
             journal=self._journal,
             encoder=self._encoder,
+            plain=self._budget is not None and self._budget.raised and self._apart,
         )
 
     def _fitted(
@@ -271,13 +283,16 @@ class Cloud:
             found=found.cut_size if found.first else len(found.added),
             added=draft.added,
             payloads=draft.payloads,
-            merged=draft.coded.merged,
+            plain=draft.payloads if draft.plain else 0,
+            completed=len(sets.completed) if sets else 0,
+            merged=draft.merged,
             reactivated=len(sets.reactivated) if sets else 0,
             removed=len(sets.removed) if sets else 0,
             evicted=len(sets.change.evicted) if sets else 0,
             held=len(self.table),
             pending=portion.pending,
             pending_error_px=portion.pending_error_px,
+            pending_harmonics=self.table.plain_in_cut,
             deferred_bytes=round(portion.pending * per_node),
             escapes=draft.coded.escapes,
             message_bytes=len(draft.message),

@@ -27,6 +27,8 @@ from lod_cloud.protocol import RemoteProtocolError
 
 _HASHES = struct.Struct("<QI")  # state, codec
 _EVENTS, _LISTS = 1, 0
+_PLAIN, _COMPLETING = 2, 4  # added to it
+_KINDS = (_LISTS, _LISTS | _PLAIN, _EVENTS, _EVENTS | _PLAIN, _EVENTS | _COMPLETING)
 _PROBE = struct.Struct("<QI")
 _REPORT = struct.Struct("<QIIQIB")
 _MISSING, _START_OVER = 1, 2
@@ -50,6 +52,9 @@ class DeltaCut:
     state_hash: int  # of the management table after this message
     codec_hash: int  # version of the codec's parameters and codebook; its lower half travels
     events: Events | None = None  # instead of the three lists, and of ids in the payload
+    plain: bool = False  # the payload comes without harmonics above degree 0
+    completed: int = 0  # so many of `ManagementTable.waiting` get theirs, of a step
+    harmonics: bytes = b""  # the codec's coding of these
 
     def to_bytes(self, numbers: ChildNumbers) -> bytes:
         """Body of a message in a session with these child numbers."""
@@ -58,11 +63,15 @@ class DeltaCut:
         for number in (*places, self.frame):
             writer.varint(number)
         writer.raw(_HASHES.pack(self.state_hash, self.codec_hash & _LOW_HALF))
+        kind = _LISTS if self.events is None else _EVENTS
+        writer.varint(kind | _PLAIN * self.plain | _COMPLETING * (self.completed > 0))
+        if self.completed:
+            writer.varint(self.completed)
+            writer.varint(len(self.harmonics))
+            writer.raw(self.harmonics)
         if self.events is not None:
-            writer.varint(_EVENTS)
             writer.raw(self.events.to_bytes(numbers))
         else:
-            writer.varint(_LISTS)
             for ids in (self.reactivated, self.removed, self.dropped):
                 writer.varint(len(ids))
                 writer.ascending(ids)
@@ -76,7 +85,7 @@ class DeltaCut:
         session, sequence, back, index, frame = (reader.varint() for _ in range(5))
         state_hash, codec_hash = _HASHES.unpack(reader.raw(_HASHES.size))
         kind = reader.varint()
-        if kind not in (_EVENTS, _LISTS):
+        if kind not in _KINDS:
             raise RemoteProtocolError(f"search {index}: must carry either events or lists")
         if max(sequence, index, frame) > _LARGEST:
             raise RemoteProtocolError(f"sequence, search and frame must be at most {_LARGEST}")
@@ -84,10 +93,14 @@ class DeltaCut:
             raise RemoteProtocolError(
                 f"base must be below sequence number {sequence}, not {sequence - back}"
             )
-        events = Events.read(reader, numbers) if kind == _EVENTS else None
+        completed = reader.varint() if kind & _COMPLETING else 0
+        harmonics = reader.raw(reader.varint()) if kind & _COMPLETING else b""
+        if not kind & _COMPLETING == _COMPLETING * (completed > 0):
+            raise RemoteProtocolError(f"search {index}: must complete at least one node, or none")
+        events = Events.read(reader, numbers) if kind & _EVENTS else None
         nothing = np.empty(0, np.int32)
         reactivated, removed, dropped = (
-            read_ids(reader) if kind == _LISTS else nothing for _ in range(3)
+            nothing if kind & _EVENTS else read_ids(reader) for _ in range(3)
         )
         return cls(
             session=session,
@@ -102,6 +115,9 @@ class DeltaCut:
             state_hash=state_hash,
             codec_hash=codec_hash,
             events=events,
+            plain=bool(kind & _PLAIN),
+            completed=completed,
+            harmonics=harmonics,
         )
 
 

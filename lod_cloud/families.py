@@ -52,11 +52,17 @@ class Families:
             near[~there] = self.children[np.searchsorted(self.parents, near[~there])]
         return near
 
-    def merged(self, tops: Int32, parents: Int32, held: LocalSubgraph) -> NodeRecords:
-        """These collapsed nodes (ascending, with their parents), from the bottom up."""
+    def merged(
+        self, tops: Int32, parents: Int32, held: LocalSubgraph, table: ManagementTable
+    ) -> NodeRecords:
+        """These collapsed nodes (ascending, with their parents), from the bottom up. Raises
+        RemoteProtocolError where harmonics are missing for that.
+        """
         wanted = np.isin(self.parents, self._with_inner(tops))
         children, above = self.children[wanted], self.parents[wanted]
         known = held.records(np.sort(without(children, self.inner)))
+        if table.plain(known.ids).any():
+            raise RemoteProtocolError("a node must not be merged from others without harmonics")
         while len(children):
             missing = ~np.isin(children, known.ids, assume_unique=True)
             ready = ~np.isin(above, above[missing])

@@ -16,8 +16,8 @@ class Entry:
 
     sequence: int
     state_hash: int  # of the table after it
-    named: Int32  # nodes whose place it set
-    brought: Int32  # nodes it sent: the client may hold them or not
+    named: Int32  # nodes whose place it set; not all that it only completed
+    brought: Int32  # nodes it sent or completed: the client may hold them or not, and how
     from_nothing: bool  # only a start from nothing makes up for it
     size: int  # node ids it was about
 
@@ -102,8 +102,8 @@ class Journal:
         """
         if self.applied == 0 or any(entry.from_nothing for entry in self._entries):
             return None
-        named = np.unique(np.concatenate([_NOTHING, *(e.named for e in self._entries)]))
         brought = np.unique(np.concatenate([_NOTHING, *(e.brought for e in self._entries)]))
+        named = np.unique(np.concatenate([brought, *(e.named for e in self._entries)]))
         return None if len(named) + len(brought) > self.node_limit else (named, brought)
 
 

@@ -36,6 +36,7 @@ class Sets:
     reactivated: Int32
     removed: Int32
     dropped: Int32
+    completed: Int32  # held plain before
     entry: Entry  # what to remember of it
     events: Events | None = None  # says the same as the lists
 
@@ -50,7 +51,9 @@ class Draft:
     table: ManagementTable | None = None
     sets: Sets | None = None
     added: int = 0
+    merged: int = 0  # nodes that the client merges
     coded: Encoded = NOTHING_CODED
+    plain: bool = False  # the nodes sent are
 
     @property
     def payloads(self) -> int:
@@ -75,21 +78,34 @@ class MessageWriter:
     table: ManagementTable
     journal: Journal
     encoder: TreeEncoder
+    plain: bool  # what is sent comes without harmonics above degree 0
 
     def probe(self, portion: Portion) -> Draft:
         """Without a change; ``portion`` says what is pending."""
         body = Probe(self.session, self.sequence).to_bytes()
         return Draft("probe", seal(PROBE, body), portion)
 
-    def step(self, portion: Portion) -> Draft:
-        """What follows the message before."""
+    def step(self, portion: Portion, completing: int = 0) -> Draft:
+        """What follows the message before; so many of the nodes that wait for their harmonics get
+        them, see `waiting`.
+        """
         added, removed = self._changed(portion)
-        change = self.table.prepare_step(self.search_index, added, removed)
-        back = added[self.table.holds(added)]
-        entry = self._entry(change, np.concatenate([added, removed]), change.needed)
+        held = self.table.holds(added)
+        fresh, back = added[~held], added[held]
         events = Events.of(self.encoder.tree, portion.expanded, portion.collapsed)
-        sets = Sets(self.sequence, change, change.needed, back, removed, _NOTHING, entry, events)
-        return self._written("step", self.table, sets, portion, len(added))
+        events, sent = self.encoder.told(events, fresh, self.table)
+        completed = self.waiting(portion)[:completing] if completing else _NOTHING
+        change = self.table.prepare_step(
+            self.search_index, added, removed, sent if self.plain else _NOTHING, completed
+        )
+        brought = np.concatenate([fresh, completed])
+        entry = self._entry(change, np.concatenate([added, removed]), brought)
+        sets = Sets(self.sequence, change, sent, back, removed, _NOTHING, completed, entry, events)
+        return self._written("step", self.table, sets, portion, len(added), len(fresh))
+
+    def waiting(self, portion: Portion) -> Int32:
+        """Nodes held plain that stay in the cut, in the order in which they are completed."""
+        return self.table.waiting(self._changed(portion)[1])
 
     def repair(self, portion: Portion, names: tuple[Int32, Int32]) -> Draft:
         """Sets every node that a message underway may have touched, whatever arrived of them:
@@ -103,20 +119,23 @@ class MessageWriter:
         doubtful = np.isin(named, names[1]) | ~self.table.holds(named)
         drawn = self.table.in_cut(named) & ~np.isin(named, removed) | np.isin(named, added)
         left, dropped = named[~drawn & ~doubtful], named[~drawn & doubtful]
-        change = self.table.prepare(self.search_index, named[drawn], left, dropped)
         sent, back = named[drawn & doubtful], named[drawn & ~doubtful]
+        values = (sent, _NOTHING) if self.plain else (_NOTHING, sent)
+        change = self.table.prepare(self.search_index, named[drawn], left, dropped, *values)
         entry = self._entry(change, named, named[doubtful])
-        sets = Sets(self.journal.applied, change, sent, back, left, dropped, entry)
-        return self._written("repair", self.table, sets, portion, len(added))
+        sets = Sets(self.journal.applied, change, sent, back, left, dropped, _NOTHING, entry)
+        return self._written("repair", self.table, sets, portion, len(added), len(sent))
 
     def start(self, portion: Portion) -> Draft:
         """The client's whole cut, from nothing."""
         cut = self._changed(portion)[0] if len(portion.expanded) else _ROOT
         table = self.table.emptied()
-        change = table.prepare_step(self.search_index, cut, _NOTHING)
+        plain = cut if self.plain else _NOTHING
+        change = table.prepare_step(self.search_index, cut, _NOTHING, plain)
         entry = Entry.start(self.sequence + 1, change.state_hash)
-        sets = Sets(0, change, cut, _NOTHING, _NOTHING, _NOTHING, entry)
-        return self._written("start", table, sets, portion, len(cut))
+        events = Events.start(self.encoder.tree, portion.expanded)
+        sets = Sets(0, change, cut, _NOTHING, _NOTHING, _NOTHING, _NOTHING, entry, events)
+        return self._written("start", table, sets, portion, len(cut), len(cut))
 
     def _changed(self, portion: Portion) -> tuple[Int32, Int32]:
         """Nodes that enter and leave the client's cut."""
@@ -131,12 +150,21 @@ class MessageWriter:
         return Entry.change(self.sequence + 1, change.state_hash, named, brought, limit)
 
     def _written(
-        self, kind: MessageKind, table: ManagementTable, sets: Sets, portion: Portion, added: int
+        self,
+        kind: MessageKind,
+        table: ManagementTable,
+        sets: Sets,
+        portion: Portion,
+        added: int,
+        fresh: int,
     ) -> Draft:
+        """``fresh``: nodes sent, and those that the client merges instead."""
         if sets.events is None:
-            coded = self.encoder.encode(sets.sent)
+            coded = self.encoder.encode(sets.sent, plain=self.plain)
         else:
-            coded = self.encoder.encode_step(sets.events, sets.sent, table)
+            coded = self.encoder.encode_step(sets.events, sets.sent, table, plain=self.plain)
+        some = len(sets.completed) > 0
+        harmonics = self.encoder.encode_harmonics(sets.completed) if some else NOTHING_CODED
         delta = DeltaCut(
             session=self.session,
             sequence=self.sequence + 1,
@@ -145,11 +173,16 @@ class MessageWriter:
             frame=self.frame,
             reactivated=_NOTHING if sets.events else sets.reactivated,
             removed=_NOTHING if sets.events else sets.removed,
-            events=coded.events,
+            events=sets.events,
+            plain=self.plain,
+            completed=harmonics.sent,
+            harmonics=harmonics.payload,
             dropped=sets.dropped,
             payload=coded.payload,
             state_hash=sets.change.state_hash,
             codec_hash=self.encoder.codec.version,
         )
         message = seal(DELTA_CUT, delta.to_bytes(self.encoder.child_numbers))
-        return Draft(kind, message, portion, table, sets, added, coded)
+        return Draft(
+            kind, message, portion, table, sets, added, fresh - len(sets.sent), coded, self.plain
+        )

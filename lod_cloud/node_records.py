@@ -21,7 +21,7 @@ _LARGEST = 2**31 - 1
 class NodeRecords:
     """What a client must know of some nodes: Gaussian, node sphere, place in the tree."""
 
-    ids: Int32  # [N] ascending
+    ids: Int32  # [N] ascending; in a payload of a step as they travel
     parents: Int32  # [N], -1 for the root
     child_counts: Int32  # [N], 0 for leaves
     radius: Float32  # [N], 0 for leaves
@@ -33,7 +33,7 @@ class NodeRecords:
 
     @classmethod
     def of(cls, tree: LodTree, ids: Int32) -> NodeRecords:
-        """The nodes ``ids`` (ascending) of a tree."""
+        """The nodes ``ids`` of a tree."""
         counts = tree.child_count[ids]
         inner = (counts > 0).astype(np.float32)
         radius, extent = tree.radius[ids] * inner, tree.extent[ids] * inner
@@ -103,6 +103,8 @@ def read_places(reader: ColumnReader, places: tuple[Int32, Int32] | None) -> tup
         parents = np.cumsum(reader.integers(count)) - 1
         if count and max(ids[-1], parents[-1]) > _LARGEST:
             raise RemoteProtocolError(f"node ids must be at most {_LARGEST}")
+        if (parents >= ids).any():
+            raise RemoteProtocolError("a parent must have a smaller id than its child")
         return ids.astype(np.int32), parents.astype(np.int32)
     if len(places[0]) != count:
         raise RemoteProtocolError(f"payload must have {len(places[0])} nodes, not {count}")

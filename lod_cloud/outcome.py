@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lod_cloud.cut import without
+from lod_cloud.depth_first import depth_first
 from lod_cloud.events import Events
 from lod_cloud.families import Families
 from lod_cloud.lod_tree import Int32
@@ -15,6 +16,8 @@ from lod_cloud.node_records import NodeRecords
 from lod_cloud.protocol import RemoteProtocolError
 from lod_cloud.subgraph import LocalSubgraph
 
+_ROOT = np.zeros(1, np.int32)
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -22,9 +25,9 @@ class Outcome:
 
     entered: Int32  # in the cut now, ascending
     left: Int32  # in the cut before, ascending
-    sent: Int32  # of ``entered``: not held, and not merged from what is held; ascending
+    sent: Int32  # of ``entered``: not held, and not merged from what is held; as they travel
     sent_parents: Int32
-    references: Int32  # for each of ``sent`` a node held, which its coding may refer to
+    references: Int32  # for each of ``sent`` a node held, which its coding may refer to; if any is
     merged: NodeRecords  # of ``entered``: not held, but their children
 
 
@@ -32,7 +35,8 @@ def outcome(
     events: Events, table: ManagementTable, held: LocalSubgraph, *, merges: bool
 ) -> Outcome:
     """Nodes from events, by what a client holds, which merges collapsed nodes itself if ``merges``.
-    Raises RemoteProtocolError for events that do not fit it.
+    To one that holds nothing the root is new, and may be expanded at once. Raises
+    RemoteProtocolError for events that do not fit it.
     """
     for ids in (events.expanded, events.tops, events.inner):
         if len(ids) and ids[-1] >= table.nodes:
@@ -50,6 +54,8 @@ def outcome(
     offsets = np.arange(total) - np.repeat(begins, counts)
     nodes = (np.repeat(events.first_children, counts) + offsets).astype(np.int32)
     parents = np.repeat(events.expanded, counts)
+    if not len(table):
+        nodes, parents = np.append(_ROOT, nodes), np.append(_ROOT - 1, parents)
     if (np.diff(nodes) <= 0).any():
         raise RemoteProtocolError("children of different nodes must differ")
     drawn = ~np.isin(nodes, events.expanded)
@@ -57,6 +63,8 @@ def outcome(
     left = np.union1d(events.expanded[known], families.drawn).astype(np.int32)
     new_tops = ~table.holds(events.tops)
     wanted, wanted_parents = events.tops[new_tops], events.top_parents[new_tops]
+    if (parents >= nodes).any() or (wanted_parents >= wanted).any():
+        raise RemoteProtocolError("a parent must have a smaller id than its child")
     entered = np.concatenate([nodes[drawn], events.tops])
     if len(entered) and not 0 <= entered.min() <= entered.max() < table.nodes:
         raise RemoteProtocolError(f"node ids must be below {table.nodes}")
@@ -68,14 +76,18 @@ def outcome(
     near = np.concatenate(
         [_ancestors(fresh, nodes, parents, table), families.first_held(wanted[apart], table)]
     )
-    order = np.argsort(sent)
+    ascending = np.argsort(sent)
+    sent, above, near = sent[ascending], above[ascending], near[ascending]
+    order = depth_first(
+        sent, above, events.expanded, _parents_if_any(events.expanded, nodes, parents)
+    )
     return Outcome(
         np.sort(entered),
         left,
         sent[order],
         above[order],
         near[order],
-        families.merged(merged, wanted_parents[~apart], held),
+        families.merged(merged, wanted_parents[~apart], held, table),
     )
 
 
@@ -84,8 +96,18 @@ def _parents(ids: Int32, nodes: Int32, parents: Int32) -> Int32:
     return parents[np.searchsorted(nodes, ids)]
 
 
+def _parents_if_any(ids: Int32, nodes: Int32, parents: Int32) -> Int32:
+    """The same, -1 for other nodes."""
+    found = np.full(len(ids), -1, np.int32)
+    known = np.isin(ids, nodes, assume_unique=True)
+    found[known] = _parents(ids[known], nodes, parents)
+    return found
+
+
 def _ancestors(ids: Int32, nodes: Int32, parents: Int32, table: ManagementTable) -> Int32:
-    """The nearest ancestor held of each of ``ids``, which are some of ``nodes``."""
+    """The nearest ancestor held of each of ``ids``, some of ``nodes``; -1 if nothing is held."""
+    if not len(table):
+        return np.full(len(ids), -1, np.int32)
     near = _parents(ids, nodes, parents)
     while not (there := table.holds(near)).all():
         if not np.isin(near[~there], nodes).all():

@@ -20,6 +20,8 @@ class SearchStats:
     found: int  # in that cut and not in the one found before
     added: int  # in the client's cut now, not before; payloads + merged + reactivated (step)
     payloads: int  # nodes sent
+    plain: int  # of them: without harmonics above degree 0
+    completed: int  # nodes sent plain before that got theirs
     merged: int  # nodes that the client computes from their children instead
     reactivated: int  # nodes named because the client still holds them
     removed: int  # in the client's cut before the message, not after
@@ -27,6 +29,7 @@ class SearchStats:
     held: int  # nodes the client holds after the message
     pending: int  # nodes of the cut found that the client's cut lacks after the message
     pending_error_px: float  # the tau the client's cut is complete at, if above `tau_px`; 0 if not
+    pending_harmonics: int  # nodes of the client's cut that it holds plain
     deferred_bytes: int  # what the pending nodes are expected to take
     escapes: int  # payloads sent in float32
     message_bytes: int  # on the line

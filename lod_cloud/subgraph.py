@@ -78,6 +78,10 @@ class LocalSubgraph:
         if len(change.evicted) or len(arrived):
             self._first_child, self._complete = _link(self.ids, self._parents, self._child_counts)
 
+    def complete(self, ids: Int32, above: Float32) -> None:
+        """Set the harmonics above degree 0, ``above`` [N, K - 1, 3], of nodes held."""
+        self._store[-1][self._slots[np.searchsorted(self.ids, ids)], 1:] = above
+
     def child_counts(self, ids: Int32) -> Int32:
         """Number of children of nodes held."""
         return self._child_counts[np.searchsorted(self.ids, ids)]

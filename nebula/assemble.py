@@ -82,6 +82,7 @@ def _pacing(session: Session) -> dict[str, Any]:
         "budget_bytes": session.budget_bytes,
         "pending_nodes": [s.pending for s in searches],
         "pending_error_px": [error if math.isfinite(error) else None for error in errors],
+        "pending_harmonics": [s.pending_harmonics for s in searches],
         "deferred_bytes": [s.deferred_bytes for s in searches],
         "tau_px": [s.tau_px for s in searches],
     }

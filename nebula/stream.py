@@ -20,7 +20,7 @@ from nebula.session_config import SessionConfig, load_session_config
 from nebula.stream_measurement import Faults, Player, first_pictures
 
 SEARCHES = 450
-_TOTALS = ("payloads", "reactivated", "merged", "escapes")
+_TOTALS = ("payloads", "plain", "completed", "reactivated", "merged", "escapes")
 _PERCENTILES = (50, 99, 100)
 
 
@@ -130,6 +130,7 @@ def summarise(rows: Sequence[dict[str, Any]], interval_s: float, tau_px: float) 
         "mbps": sum(sizes) * 8e-6 / (len(counted) * interval_s) if counted else None,
         "pending_max": max(row["pending"] for row in rows),
         "pending_searches": sum(row["pending"] > 0 for row in rows),
+        "pending_harmonics": rows[-1]["pending_harmonics"],
         "held_max": max(row["held"] for row in rows),
         "behind_max": max(row["behind"] for row in rows),
         "messages_lost": sum(row["lost"] for row in rows),
@@ -161,7 +162,8 @@ def _text(data: dict[str, Any]) -> str:
     if data["budget_bytes"] is not None:
         lines.append(
             f"at most {data['budget_bytes']} B per message: {s['pending_searches']} messages left "
-            f"something pending, at most {s['pending_max']} nodes"
+            f"something pending, at most {s['pending_max']} nodes; {s['pending_harmonics']} nodes "
+            "of the last cut without harmonics above degree 0"
         )
     kinds = ", ".join(f"{count} {kind}" for kind, count in s["kinds"].items() if count)
     lines.append(

@@ -1,7 +1,7 @@
 """How tree nodes travel: the paper's coding, and a compact one that needs half the bytes."""
 
 from lod_cloud.codec.compact import CompactCodec
-from lod_cloud.codec.interface import NOTHING_CODED, Codec, Encoded, References
+from lod_cloud.codec.interface import NOTHING_CODED, Codec, Encoded, Neighbours, References
 from lod_cloud.codec.paper import PaperCodec
 from lod_cloud.codec.reading import read_codec
 
@@ -10,6 +10,7 @@ __all__ = [
     "Codec",
     "CompactCodec",
     "Encoded",
+    "Neighbours",
     "PaperCodec",
     "References",
     "read_codec",

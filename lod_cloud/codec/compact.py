@@ -37,15 +37,15 @@ from numpy.typing import NDArray
 from gaussians.codebook import Codebook
 from gaussians.compression import UInt16
 from gaussians.errors import InputError
-from lod_cloud.codec.interface import Encoded, References
-from lod_cloud.codec.node_columns import Column, Layout, Rows
+from lod_cloud.codec.harmonic_words import HarmonicWords
+from lod_cloud.codec.interface import Encoded, Neighbours, References
+from lod_cloud.codec.node_columns import Layout, Rows
 from lod_cloud.codec.node_fields import NodeFields
-from lod_cloud.codec.node_tables import Tables, count_tables, layout_of
+from lod_cloud.codec.node_tables import Tables, count_tables, layout_of, pulling, pushing
 from lod_cloud.codec.rans import Frequencies, Puller, Pusher
 from lod_cloud.codec.tolerance import merge_tolerance
 from lod_cloud.codec.training import (
     Sample,
-    check_words,
     drawn_nodes,
     harmonics,
     pack,
@@ -54,7 +54,7 @@ from lod_cloud.codec.training import (
     words_of,
 )
 from lod_cloud.columns import ColumnReader, ColumnWriter
-from lod_cloud.lod_tree import Float32, Int32, LodTree
+from lod_cloud.lod_tree import Int32, LodTree
 from lod_cloud.node_records import (
     NodeRecords,
     read_child_counts,
@@ -117,6 +117,11 @@ class CompactCodec:
         """The columns of a payload."""
         return layout_of(self.fields, self.codebook)
 
+    @cached_property
+    def apart(self) -> HarmonicWords | None:
+        """How harmonics above degree 0 travel alone; None without any."""
+        return HarmonicWords(self.codebook, self.layout, self.tables) if self.codebook else None
+
     @property
     def merges(self) -> bool:
         """Whether clients merge the children of collapsed nodes."""
@@ -177,6 +182,7 @@ class CompactCodec:
         *,
         places: bool,
         references: References | None = None,
+        plain: bool = False,
     ) -> Encoded:
         """See `Codec.encode`."""
         codes, exact = self.fields.encode(nodes)
@@ -192,32 +198,23 @@ class CompactCodec:
         writer.begin("escapes")
         writer.positions(np.flatnonzero(exact))
         writer.plain(nodes.float32_rows(np.flatnonzero(exact), coefficients=1))
-        writer.positions(np.flatnonzero(~near))
-        writer.plain(harmonics(nodes.gaussians, np.flatnonzero(~near)))
-        rows = [Rows.of(inner[some], nodes.parents[some]) for some in (kept, near)]
-        pusher = Pusher()
-
-        def push(
-            key: str, _: tuple[int, int], contexts: Column, values: Column | None, /
-        ) -> Column:
-            assert values is not None
-            pusher.add(key.split(".")[0], self.tables[key], values, contexts)
-            return values
-
-        self.layout.pass_through(
-            push,
-            rows,
-            codes.columns(kept, inner, self.layout.colours)
-            | self.layout.high_parts(words[near])
-            | {"position": choices},
+        above = None if plain else self.apart
+        if above:
+            above.write_far(writer, near, harmonics(nodes.gaussians, np.flatnonzero(~near)))
+        rows, pusher = (
+            Rows.of(inner, nodes.parents, references.ids if references else None),
+            Pusher(),
         )
+        given = codes.columns(kept, inner, self.layout.colours) | {"position": choices}
+        self.layout.fields(pushing(pusher, self.tables), rows.take(kept), given)
+        if above:
+            above.push(pusher, words[near], inner[near])
         pusher.write(writer)
         writer.begin("position")
         self.fields.position.write(writer, where[0], choices)
-        writer.begin("harmonics")
-        for column, (_, low) in zip(words[near].T, self.layout.words, strict=True):
-            writer.bits(column, low)
-        escapes = int(np.count_nonzero(exact | ~near))
+        if above:
+            above.write_low(writer, words[near])
+        escapes = int(np.count_nonzero(exact | ~near if above else exact))
         return Encoded(writer.bytes(), len(nodes), escapes, writer.sizes)
 
     # ------------------------------------------------------------ decoding
@@ -226,7 +223,9 @@ class CompactCodec:
         self,
         payload: bytes,
         places: tuple[Int32, Int32] | None = None,
-        references: Float32 | None = None,
+        references: Neighbours | None = None,
+        *,
+        plain: bool = False,
     ) -> NodeRecords:
         """See `Codec.decode`."""
         reader = ColumnReader(payload)
@@ -237,49 +236,31 @@ class CompactCodec:
         child_counts[inner] = read_child_counts(reader, int(inner.sum()))
         exact = reader.positions(count)
         rows = reader.plain(np.float32, len(exact), row_width(0))
-        far = reader.positions(count)
-        width = 3 * ((self.sh_degree + 1) ** 2 - 1)
-        above = np.empty((count, width), np.float32)
-        above[far] = reader.plain(np.float32, len(far), width).reshape(len(far), width)
-        kept, near = (_all_but(some, count) for some in (exact, far))
-        known = [Rows.of(inner[some], parents[some]) for some in (kept, near)]
-        puller = Puller(reader)
-        values = self.layout.pass_through(
-            lambda key, _, contexts, __: puller.column(self.tables[key], contexts),
-            known,
-            None,
+        kept = np.ones(count, np.bool_)
+        kept[exact] = False
+        sh = np.zeros((count, (self.sh_degree + 1) ** 2, 3), np.float32)
+        above = None if plain else self.apart
+        if above:
+            numbers, near = above.read_far(reader, count)
+        known, puller = (
+            Rows.of(inner, parents, references.ids if references else None),
+            Puller(reader),
         )
+        values = self.layout.fields(pulling(puller, self.tables), known.take(kept), None)
+        words = above.pull(puller, inner[near]) if above else {}
         puller.finish()
         sigmas = self.fields.sigmas(values)
         choices = values["position"].astype(np.int64)
-        held = None if references is None else references[kept]
+        held = None if references is None else references.means[kept]
         whole = self.fields.position.read(reader, choices, sigmas[:, 0], held)
         gaussians = self.fields.decode(values, sigmas, whole)
-        self._read_harmonics(reader, values, above, near)
+        if above:
+            above.read_low(reader, words, numbers, near)
+            sh[:, 1:] = numbers.reshape(sh[:, 1:].shape)
         reader.finish()
         spheres = np.zeros((len(gaussians), 2), np.float32)
         spheres[inner[kept]] = self.fields.spheres(values, sigmas[inner[kept]])
         records = with_rows((ids, parents, child_counts), spheres, gaussians, exact, rows)
-        sh = np.concatenate([records.gaussians.sh, above.reshape(count, width // 3, 3)], axis=1)
+        sh[:, :1] = records.gaussians.sh
         scene = dataclasses.replace(records.gaussians, sh=sh)
-        return dataclasses.replace(records, gaussians=scene).check()
-
-    def _read_harmonics(
-        self, reader: ColumnReader, values: dict[str, Column], above: Float32, near: Mask
-    ) -> None:
-        """The rows of ``above`` that are ``near``."""
-        if self.codebook:
-            count = int(near.sum())
-            columns = [
-                values[f"harmonics.{stage}"].astype(np.uint32) << low | reader.bits(count, low)
-                for stage, (_, low) in enumerate(self.layout.words)
-            ]
-            words = np.stack(columns, axis=1)
-            check_words(words, self.codebook)
-            above[near] = self.codebook.decode(words.astype(np.uint16))
-
-
-def _all_but(rows: NDArray[np.int64], count: int) -> Mask:
-    kept = np.ones(count, np.bool_)
-    kept[rows] = False
-    return kept
+        return dataclasses.replace(records, gaussians=scene)

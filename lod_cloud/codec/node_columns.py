@@ -39,11 +39,17 @@ class Rows:
 
     inner: Mask  # not leaves
     siblings: Mask  # child of the same parent as the node before
+    below: Mask  # child of a node that the client holds
 
     @classmethod
-    def of(cls, inner: Mask, parents: Column) -> Rows:
-        """Nodes in the order of their ids."""
-        return cls(inner, np.diff(parents, prepend=-2) == 0)
+    def of(cls, inner: Mask, parents: Column, references: Column | None) -> Rows:
+        """Nodes as they travel, and the nodes held that they may be told from."""
+        below = np.zeros(len(inner), np.bool_) if references is None else references == parents
+        return cls(inner, np.diff(parents, prepend=-2) == 0, below)
+
+    def take(self, some: Mask) -> Rows:
+        """Of some of the nodes; a node that is left out is before others all the same."""
+        return Rows(self.inner[some], self.siblings[some], self.below[some])
 
 
 class _Columns:
@@ -98,12 +104,7 @@ class _Columns:
 
     def position(self) -> None:
         """How the lowest bits of a position are to be read."""
-        self.plain("position", CHOICES, self._place, 4)
-
-    def words(self, symbols: Sequence[int]) -> None:
-        """Of the stages of a codebook, each of so many symbols."""
-        for stage, count in enumerate(symbols):
-            self.plain(f"harmonics.{stage}", count, self._inner, 2)
+        self.plain("position", CHOICES, self._place + 4 * self._rows.below, 8)
 
 
 @dataclass(frozen=True)
@@ -124,20 +125,27 @@ class Layout:
         """What of words [N, stages] are symbols."""
         return {f"harmonics.{i}": words[:, i] >> low for i, (_, low) in enumerate(self.words)}
 
-    def pass_through(
-        self,
-        code: Coder,
-        rows: Sequence[Rows],
-        given: Mapping[str, Column] | None,
+    def fields(
+        self, code: Coder, rows: Rows, given: Mapping[str, Column] | None
     ) -> dict[str, Column]:
-        """All columns: of the nodes whose fields are coded, and of those whose harmonics are."""
-        fields, harmonics = (_Columns(code, some, given) for some in rows)
-        fields.shape()
-        fields.look(self.colours)
-        fields.spheres()
-        fields.position()
-        harmonics.words([symbols for symbols, _ in self.words])
-        return fields.values | harmonics.values
+        """All columns of nodes but those of the harmonics above degree 0."""
+        columns = _Columns(code, rows, given)
+        columns.shape()
+        columns.look(self.colours)
+        columns.spheres()
+        columns.position()
+        return columns.values
+
+    def harmonics(
+        self, code: Coder, inner: Mask, given: Mapping[str, Column] | None
+    ) -> dict[str, Column]:
+        """Words of nodes, one column for each stage of the codebook."""
+        values = {}
+        for stage, (symbols, _) in enumerate(self.words):
+            key = f"harmonics.{stage}"
+            known = None if given is None else given[key]
+            values[key] = code(key, (2, symbols), inner.astype(np.int64), known)
+        return values
 
     def shapes(self) -> dict[str, tuple[int, int]]:
         """Number of contexts and of symbols of every column."""
@@ -148,7 +156,8 @@ class Layout:
             return np.empty(0, np.int64)
 
         nothing = np.zeros(0, np.bool_)
-        self.pass_through(note, [Rows(nothing, nothing)] * 2, None)
+        self.fields(note, Rows(nothing, nothing, nothing), None)
+        self.harmonics(note, nothing, None)
         return shapes
 
 

@@ -41,7 +41,7 @@ from gaussians.compression import (
 )
 from gaussians.constants import SH_C0
 from gaussians.scene import Scene
-from lod_cloud.codec.interface import Encoded, References
+from lod_cloud.codec.interface import Encoded, Neighbours, References
 from lod_cloud.codec.training import (
     Sample,
     check_words,
@@ -94,6 +94,11 @@ class PaperCodec:
             extent=LogField.covering(sample.extent[sample.inner], round_up=True),
             codebook=train_codebook(tree, seed, words, stages),
         )
+
+    @property
+    def apart(self) -> None:
+        """The paper's coding is one word per node: nothing is sent without it."""
+        return None
 
     @property
     def merges(self) -> bool:
@@ -155,8 +160,9 @@ class PaperCodec:
         *,
         places: bool,
         references: References | None = None,
+        plain: bool = False,
     ) -> Encoded:
-        """See `Codec.encode`; references are not looked at."""
+        """See `Codec.encode`; references are not looked at, and nothing is ever plain."""
         scene = nodes.gaussians
         tile, offset, valid = self.position.encode(scene.means)
         scale, scale_valid = self.scale.encode(scene.scales)
@@ -195,9 +201,11 @@ class PaperCodec:
         self,
         payload: bytes,
         places: tuple[Int32, Int32] | None = None,
-        references: Float32 | None = None,
+        references: Neighbours | None = None,
+        *,
+        plain: bool = False,
     ) -> NodeRecords:
-        """See `Codec.decode`; references are not looked at."""
+        """See `Codec.decode`; references are not looked at, and nothing is ever plain."""
         reader = ColumnReader(payload)
         ids, parents = read_places(reader, places)
         count = len(ids)
@@ -214,7 +222,7 @@ class PaperCodec:
             spheres[inner, column] = field.decode(reader.plain(np.uint16, int(inner.sum())))
         reader.finish()
         structure = (ids, parents, child_counts)
-        return with_rows(structure, spheres, gaussians, escaped, rows).check()
+        return with_rows(structure, spheres, gaussians, escaped, rows)
 
     def _decode_scene(self, reader: ColumnReader, count: int) -> Scene:
         tile = reader.differences(np.int16, count, 3)

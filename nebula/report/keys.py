@@ -117,8 +117,9 @@ _SCENE = (
         "With `--paced` only: `budget_bytes` of a message; after each message `pending_nodes` of "
         "the cut found that the client's cut lacked, `pending_error_px`, the τ at which the "
         "client's cut was complete (0: nothing pending; null: not even around the viewer), "
-        "`deferred_bytes`, what the pending nodes were expected to take, and `tau_px` of the "
-        "search",
+        "`pending_harmonics`, nodes of the client's cut that were sent without harmonics above "
+        "degree 0 and wait for them, `deferred_bytes`, what the pending nodes were expected to "
+        "take, and `tau_px` of the search",
     ),
 )
 

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from gaussians.scene import FIELDS, Scene
 from lod_cloud.client import Client, _Arrival
@@ -14,10 +15,12 @@ from lod_cloud.cloud import Cloud
 from lod_cloud.codec import Codec, CompactCodec, PaperCodec
 from lod_cloud.criterion import SearchRequest
 from lod_cloud.cut import is_complete
-from lod_cloud.events import Events
-from lod_cloud.lod_tree import LodTree
+from lod_cloud.delta_cut import DeltaCut
+from lod_cloud.lod_tree import Int32, LodTree
+from lod_cloud.management_table import ManagementTable
 from lod_cloud.protocol import RemoteProtocolError
 from lod_cloud.search import SearchTree, make_search
+from lod_cloud.subgraph import LocalSubgraph
 from lod_cloud.tree_encoder import TreeEncoder
 from tests.lod_cloud.trees import random_tree
 
@@ -36,6 +39,13 @@ class World:
     decoded: Scene  # what a client must have for every node
     places: list[SearchRequest]
 
+    def values(self, ids: Int32, plain: NDArray[np.bool_]) -> Scene:
+        """What a client must have of nodes that it was sent, and holds plain or complete."""
+        scene = self.decoded.take(ids)
+        sh = np.where(plain[:, None, None], 0, scene.sh)
+        sh[:, 0] = scene.sh[:, 0]
+        return dataclasses.replace(scene, sh=sh)
+
 
 @cache
 def world(leaves: int, seed: int, codebook: int = 1, *, compact: bool = False) -> World:
@@ -49,6 +59,20 @@ def world(leaves: int, seed: int, codebook: int = 1, *, compact: bool = False) -
     return World(tree, SearchTree.of(tree), encoder, decoded, places)
 
 
+def world_of(tree: LodTree, codec: CompactCodec, seed: int) -> World:
+    """The same with a codec of its own and places of a random walk."""
+    encoder = TreeEncoder(tree, codec)
+    everything = encoder.encode(np.arange(len(tree), dtype=np.int32))
+    rng = np.random.default_rng(seed)
+    step, position = rng.uniform(0.1, 1.5), rng.uniform(-5, 5, 3)
+    places = []
+    for _ in range(PLACES):
+        position = position + rng.normal(0, step, 3)
+        places.append(SearchRequest(tuple(position), 200, 6))
+    decoded = codec.decode(everything.payload).gaussians
+    return World(tree, SearchTree.of(tree), encoder, decoded, places)
+
+
 class CheckedClient(Client):
     """A client that knows what should come."""
 
@@ -56,15 +80,19 @@ class CheckedClient(Client):
         super().__init__()
         self.world = where
 
-    def _from_events(self, events: Events, payload: bytes) -> _Arrival:
-        arrival = super()._from_events(events, payload)
+    def _from_events(
+        self, delta: DeltaCut, table: ManagementTable, graph: LocalSubgraph
+    ) -> _Arrival:
+        arrival, events = super()._from_events(delta, table, graph), delta.events
+        assert events is not None
         merged = np.isin(arrival.fresh.ids, events.tops) & self.world.encoder.codec.merges
         merged &= ~np.isin(arrival.fresh.ids, events.unmerged)
         assert np.count_nonzero(merged) == arrival.merged
         sent = arrival.fresh.take(np.flatnonzero(~merged))
+        assert np.array_equal(arrival.sent, sent.ids)
+        right = self.world.values(sent.ids, np.full(len(sent), delta.plain))
         for name in FIELDS:
-            right = getattr(self.world.decoded, name)[sent.ids]
-            assert np.array_equal(getattr(sent.gaussians, name), right)
+            assert np.array_equal(getattr(sent.gaussians, name), getattr(right, name))
         return arrival
 
 
@@ -99,7 +127,9 @@ class HostilePair:
         self._budget = budget
         self._place, self._frame = PLACES // 2, 0
         nothing = np.empty(0, np.int32)
-        self._states = {0: (nothing, nothing, 0)}  # of the cloud's table, by sequence number
+        # of the cloud's table, by sequence number
+        self._states = {0: (nothing, nothing, nothing.astype(np.bool_), 0)}
+        self.plain = self.completed = 0  # nodes of messages sent
 
     def act(self, action: Action) -> None:
         """One event: a search, or something that happens to what is underway."""
@@ -134,11 +164,11 @@ class HostilePair:
         assert self.cloud.stats is not None
         tau_px = self.world.places[self._place].tau_px
         pending = [self.cloud.stats.pending]
-        while pending[-1] or self.cloud.stats.tau_px > tau_px:
+        while pending[-1] or self.cloud.stats.tau_px > tau_px or self.cloud.stats.pending_harmonics:
             self._search()
             self._deliver_all()
             pending.append(self.cloud.stats.pending)
-            assert len(pending) <= 2 * len(self.world.tree)
+            assert len(pending) <= 3 * len(self.world.tree)
         return pending
 
     def _deliver_all(self) -> None:
@@ -170,7 +200,13 @@ class HostilePair:
         if self._budget is not None and len(message) > self._budget:
             events = stats.added + stats.removed
             assert stats.kind != "step" or events <= 1 + self.world.tree.child_count.max()
-        self._states[self.cloud.sequence] = table.ids, table.last, table.state_hash
+            assert stats.completed == 0 or (stats.completed, events) == (1, 0)
+        plain = table.plain(table.ids)
+        bare = np.count_nonzero(plain & table.in_cut(table.ids))
+        assert stats.pending_harmonics == table.plain_in_cut == bare
+        assert not plain.any() or self._budget is not None
+        self.plain, self.completed = self.plain + stats.plain, self.completed + stats.completed
+        self._states[self.cloud.sequence] = table.ids, table.last, plain, table.state_hash
         self.down.append(message)
 
     def _down(self, which: int) -> None:
@@ -244,21 +280,26 @@ class HostilePair:
         """The client holds what the cloud's table held after the message it applied last."""
         table, graph = self.client.table, self.client._subgraph
         assert table is not None
-        ids, last, state_hash = self._states[self.client.applied]
+        ids, last, plain, state_hash = self._states[self.client.applied]
         assert np.array_equal(table.ids, ids)
         assert np.array_equal(table.last, last)
+        assert np.array_equal(table.plain(ids), plain)
         assert table.state_hash == state_hash
         assert len(table) == len(ids)
         assert np.array_equal(graph.ids, ids)
         assert np.array_equal(graph._parents, self.world.tree.parent[ids])
         assert np.array_equal(graph._child_counts, self.world.tree.child_count[ids])
-        held, right = graph.gaussians(np.arange(len(ids), dtype=np.int32)), self.world.decoded
+        held, right = (
+            graph.gaussians(np.arange(len(ids), dtype=np.int32)),
+            self.world.values(ids, plain),
+        )
         same = np.ones(len(ids), np.bool_)
         for name in FIELDS:
-            equal = getattr(held, name) == getattr(right, name)[ids]
+            equal = getattr(held, name) == getattr(right, name)
             same &= equal.all(axis=tuple(range(1, equal.ndim)))
         self.merged += int(np.count_nonzero(~same))
         codec, true = self.world.encoder.codec, self.world.tree.gaussians.take(ids[~same])
+        assert not held.sh[plain, 1:].any()
         if not codec.merges:
             assert same.all()
         elif not same.all():  # merged by the client
@@ -266,6 +307,15 @@ class HostilePair:
             assert self.world.tree.child_count[ids[~same]].all()
             off = np.abs(held.means[~same].astype(float) - true.means)
             assert (off <= codec.tolerance * true.scales.max(axis=1, keepdims=True)).all()
+
+
+def settled(**changes: object) -> HostilePair:
+    """A session in which one message was applied and acknowledged."""
+    pair = HostilePair(world(60, 2), **changes)  # type: ignore[arg-type]
+    for action in (("walk", 1), ("down", 0), ("down", 0), ("up", 0), ("up", 0)):
+        pair.act(action)
+    assert pair.client.applied == 1
+    return pair
 
 
 FAULTS = (

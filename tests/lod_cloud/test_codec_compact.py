@@ -17,17 +17,23 @@ from gaussians.codebook import AC_ERROR
 from gaussians.errors import InputError
 from gaussians.scene import FIELDS
 from lod_cloud.build import BuildOptions, build_tree
-from lod_cloud.codec import CompactCodec, Encoded, References, compact, read_codec, training
+from lod_cloud.codec import (
+    CompactCodec,
+    Encoded,
+    Neighbours,
+    References,
+    compact,
+    read_codec,
+    training,
+)
 from lod_cloud.codec.axes import sorted_axes
 from lod_cloud.codec.rans import Frequencies
 from lod_cloud.codec.tolerance import CODED_MASS_ERROR
-from lod_cloud.criterion import SearchRequest
 from lod_cloud.lod_tree import LodTree
 from lod_cloud.node_records import NodeRecords
 from lod_cloud.protocol import RemoteProtocolError
-from lod_cloud.search import SearchTree
 from lod_cloud.tree_encoder import TreeEncoder
-from tests.lod_cloud.hostile_link import HostilePair, World
+from tests.lod_cloud.hostile_link import HostilePair, world_of
 from tests.lod_cloud.trees import random_scene, random_tree
 
 SEEDS = st.integers(0, 999)
@@ -102,7 +108,9 @@ def test_any_reference_within_the_tolerance_gives_the_same_bits(seed: int, bits:
     right = coded(tree, codec, ids)[0].gaussians
     near = rng.integers(0, len(tree), len(tree))  # any node will do
     scene = tree.gaussians
-    references = References(scene.means[near], scene.scales[near].max(axis=1))
+    references = References(
+        near.astype(np.int32), scene.means[near], scene.scales[near].max(axis=1)
+    )
     nodes = NodeRecords.of(tree, ids)
     words, good = codec.assign_words(tree, ids)
     sent = codec.encode(nodes, words, good, places=False, references=references)
@@ -110,7 +118,9 @@ def test_any_reference_within_the_tolerance_gives_the_same_bits(seed: int, bits:
     moved = references.means + share * codec.tolerance * references.sigmas[:, None]
     towards = np.where(share < 0, np.inf, -np.inf)
     clients = np.nextafter(moved.astype(np.float32), towards.astype(np.float32))
-    got = codec.decode(sent.payload, (ids, tree.parent), clients).gaussians
+    got = codec.decode(
+        sent.payload, (ids, tree.parent), Neighbours(references.ids, clients)
+    ).gaussians
     for name in FIELDS:
         assert np.array_equal(getattr(got, name), getattr(right, name))
     assert encoder.codec is codec
@@ -125,19 +135,6 @@ def test_positions_are_told_from_the_node_before_where_nothing_is_held() -> None
     together = coded(tree, codec, leaves)[1].columns["position"]
     assert 12 <= alone <= 16
     assert together < 8 * len(leaves)
-
-
-def world_of(tree: LodTree, codec: CompactCodec, seed: int) -> World:
-    encoder = TreeEncoder(tree, codec)
-    everything = encoder.encode(np.arange(len(tree), dtype=np.int32))
-    rng = np.random.default_rng(seed)
-    step, position = rng.uniform(0.1, 1.5), rng.uniform(-5, 5, 3)
-    places = []
-    for _ in range(48):
-        position = position + rng.normal(0, step, 3)
-        places.append(SearchRequest(tuple(position), 200, 6))
-    decoded = codec.decode(everything.payload).gaussians
-    return World(tree, SearchTree.of(tree), encoder, decoded, places)
 
 
 @given(

@@ -13,6 +13,7 @@ from gaussians.errors import InputError
 from lod_cloud.child_numbers import ChildNumbers
 from lod_cloud.cut import without
 from lod_cloud.delta_cut import DeltaCut, Probe, Report
+from lod_cloud.events import Events
 from lod_cloud.lod_tree import Int32
 from lod_cloud.management_table import IN_CUT, ManagementTable, TableChange
 from lod_cloud.protocol import RemoteProtocolError, seal, unseal
@@ -152,6 +153,55 @@ def test_a_state_can_be_set_whatever_was_before(
     assert set(again.evicted.tolist()) == {n for n, last in expected.items() if index - last > 2}
 
 
+@given(cuts, st.integers(0, 999), st.sampled_from([0, 6]))
+@settings(max_examples=60)
+def test_plain_and_complete_are_part_of_the_state(
+    found: list[set[int]], seed: int, window: int
+) -> None:
+    """The table equals a dictionary whatever comes plain and is completed; what is not held is not
+    plain; and another history of the same state gives the same hash.
+    """
+    rng = np.random.default_rng(seed)
+    table, fresh = ManagementTable(13, 2, window), ManagementTable(13, 2, window)
+    plain: set[int] = set()
+    for index, cut in enumerate(found):
+        before, after = set(table.cut_ids.tolist()), ids(*sorted(cut))
+        added, removed = ids(*sorted(cut - before)), ids(*sorted(before - cut))
+        fresh_nodes = added[~table.holds(added)]
+        sent = fresh_nodes[rng.random(len(fresh_nodes)) < 0.6]
+        waiting = table.waiting(removed)
+        assert set(waiting.tolist()) == plain & before & cut
+        done = waiting[: rng.integers(0, len(waiting) + 1)]
+        change = table.prepare_step(index, added, removed, sent, done)
+        table.commit(change)
+        plain = (plain - set(done.tolist()) | set(sent.tolist())) & set(table.ids.tolist())
+        assert set(np.flatnonzero(table.plain(np.arange(13, dtype=np.int32)))) == plain
+        assert table.plain_in_cut == len(plain & cut) == change.plain_in_cut
+        # the same at once: every node of the cut named, with what it is
+        bare = after[table.plain(after)]
+        others = without(after, bare)
+        again = fresh.prepare(index, after, removed, ids(), bare, others)
+        fresh.commit(again)
+        assert fresh.state_hash == table.state_hash
+        assert fresh.plain_in_cut == table.plain_in_cut
+
+
+def test_plain_and_complete_nodes_have_different_hashes() -> None:
+    tables = [ManagementTable(16, 4, 32) for _ in range(3)]
+    for table, plain in zip(tables, (ids(), ids(1), ids(2)), strict=True):
+        table.commit(table.prepare_step(0, ids(1, 2), ids(), plain))
+    assert len({table.state_hash for table in tables}) == 3
+    done = tables[1].prepare_step(1, ids(), ids(), ids(), ids(1))
+    assert done.state_hash == tables[0].state_hash
+    with pytest.raises(InputError, match="every node to be completed must be held"):
+        tables[1].prepare_step(1, ids(), ids(), ids(), ids(5))
+    left = tables[1].prepare_step(1, ids(), ids(1))
+    tables[1].commit(left)
+    assert tables[1].waiting(ids()).tolist() == [] and tables[1].plain_in_cut == 0
+    tables[1].commit(tables[1].prepare_step(2, ids(1), ids()))
+    assert tables[1].waiting(ids()).tolist() == [1]  # came back as it was held
+
+
 def test_the_queue_of_those_that_left_stays_in_proportion() -> None:
     """Two cuts in turn: every node leaves again and again within the reuse window."""
     table = ManagementTable(40_000, 1, 250)
@@ -180,6 +230,23 @@ def test_messages_round_trip() -> None:
     back = DeltaCut.from_bytes(delta.to_bytes(numbers), numbers)
     for field in dataclasses.fields(delta):
         assert np.array_equal(getattr(back, field.name), getattr(delta, field.name))
+    events = Events(ids(), ids(), ids(), ids(), ids(), ids(), ids(), ids())
+    none = {"reactivated": ids(), "dropped": ids(), "events": events}
+    completing = dataclasses.replace(delta, **none, completed=300, harmonics=b"some")
+    plain = dataclasses.replace(delta, plain=True)
+    for other in (plain, completing):
+        back = DeltaCut.from_bytes(other.to_bytes(numbers), numbers)
+        assert (back.plain, back.completed) == (other.plain, other.completed)
+        assert (back.harmonics, back.payload) == (other.harmonics, b"payload")
+    for wrong in (
+        dataclasses.replace(completing, plain=True),
+        dataclasses.replace(delta, completed=2, harmonics=b"x"),
+    ):
+        with pytest.raises(RemoteProtocolError, match="must carry either events or lists"):
+            DeltaCut.from_bytes(wrong.to_bytes(numbers), numbers)
+    none_at_all = completing.to_bytes(numbers).replace(b"\xac\x02\x04some", b"\x00\x04some")
+    with pytest.raises(RemoteProtocolError, match="must complete at least one node, or none"):
+        DeltaCut.from_bytes(none_at_all, numbers)
     with pytest.raises(RemoteProtocolError, match="more bytes"):
         DeltaCut.from_bytes(delta.to_bytes(numbers)[:20], numbers)
     late = dataclasses.replace(delta, search_index=2**31)

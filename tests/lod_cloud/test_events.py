@@ -5,15 +5,18 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lod_cloud.child_numbers import ChildNumbers
 from lod_cloud.client import Client
 from lod_cloud.cloud import Cloud
 from lod_cloud.columns import ColumnReader
 from lod_cloud.delta_cut import DeltaCut
 from lod_cloud.events import Events
 from lod_cloud.lod_tree import Int32
+from lod_cloud.outcome import outcome
 from lod_cloud.protocol import DELTA_CUT, RemoteProtocolError, seal, unseal
 from lod_cloud.search import SearchTree, flat_search, make_search
 from tests.lod_cloud.hostile_link import PLACES, World, world
@@ -38,9 +41,9 @@ def test_tops_are_the_collapsed_nodes_that_are_drawn(leaves: int, seed: int) -> 
         before = cut
 
 
-def talking(where: World) -> tuple[Cloud, Client]:
+def talking(where: World, budget: int | None = None) -> tuple[Cloud, Client]:
     """A session after a few searches."""
-    cloud, client = Cloud(where.tree, where.encoder), Client()
+    cloud, client = Cloud(where.tree, where.encoder, budget_bytes=budget), Client()
     client.receive(cloud.session_start())
     for frame, place in enumerate((20, 21, 24, 23)):
         client.receive(cloud.search(where.places[place], frame))
@@ -65,6 +68,36 @@ def test_a_step_carries_no_lists_and_no_ids() -> None:
     again = Events.read(ColumnReader(step.events.to_bytes(numbers)), numbers)
     for field in dataclasses.fields(Events):
         assert np.array_equal(getattr(again, field.name), getattr(step.events, field.name))
+
+
+@given(st.integers(0, 9999), st.floats(0.5, 12.0), st.integers(1, 200))
+@settings(max_examples=60)
+def test_first_children_far_apart_and_close_together(seed: int, spread: float, count: int) -> None:
+    """In a tree of 40 M nodes, whose numbering both ends know at some places only."""
+    rng = np.random.default_rng(seed)
+    nodes = 40_000_000
+    knots = np.sort(rng.integers(1, nodes, 4096))
+    numbers = ChildNumbers(nodes, np.append(knots, nodes).astype(np.int64))
+    gaps = np.ceil(np.exp(rng.uniform(0, spread, count))).astype(np.int64)
+    expanded = np.cumsum(gaps).astype(np.int32)
+    begins = (expanded + np.cumsum(rng.integers(1, 9, count) * gaps)).astype(np.int32)
+    nothing = expanded[:0]
+    events = Events(expanded, begins, nothing, nothing, nothing, nothing, nothing, nothing)
+    again = Events.read(ColumnReader(events.to_bytes(numbers)), numbers)
+    assert np.array_equal(again.expanded, expanded)
+    assert np.array_equal(again.first_children, begins)
+
+
+def test_children_with_smaller_ids_than_their_parents_are_refused() -> None:
+    """Before anything is done with them."""
+    where = world(60, 2)
+    _, client = talking(where)
+    assert client.table is not None
+    node = client.table.cut_ids[where.tree.child_count[client.table.cut_ids] > 0][-1:]
+    nothing = node[:0]
+    events = Events(node, node - 2, nothing, nothing, nothing, nothing, nothing, nothing)
+    with pytest.raises(RemoteProtocolError, match="a parent must have a smaller id"):
+        outcome(events, client.table, client._subgraph, merges=False)
 
 
 def test_what_was_counted_is_what_the_cloud_counted() -> None:
@@ -133,12 +166,22 @@ def test_strange_events_never_lead_astray(
     assert client.table.state_hash == cloud.table.state_hash
 
 
-@given(st.integers(0, PLACES - 1), st.integers(0, 4000), st.integers(1, 255), st.booleans())
-@settings(max_examples=100)
-def test_strange_bytes_never_lead_astray(place: int, at: int, flip: int, compact: bool) -> None:
-    """A message with a right checksum around wrong bytes: refused, or the same nodes."""
+@given(
+    st.integers(0, PLACES - 1),
+    st.integers(0, 4000),
+    st.integers(1, 255),
+    st.booleans(),
+    st.sampled_from([None, 300, 500, 900]),
+)
+@settings(max_examples=150)
+def test_strange_bytes_never_lead_astray(
+    place: int, at: int, flip: int, compact: bool, budget: int | None
+) -> None:
+    """A message with a right checksum around wrong bytes: refused, or the same nodes. With a budget
+    some are held plain, or about to be completed.
+    """
     where = world(60, 2, compact=compact)
-    cloud, client = talking(where)
+    cloud, client = talking(where, budget)
     body = bytearray(unseal(cloud.search(where.places[place], 9))[1])
     body[at % len(body)] ^= flip
     assert client.table is not None

@@ -12,22 +12,13 @@ from hypothesis import strategies as st
 from lod_cloud.client import EARLY_MESSAGES
 from lod_cloud.delta_cut import Report
 from lod_cloud.protocol import REPORT, RemoteProtocolError, seal
-from tests.lod_cloud.hostile_link import PLACES, Action, HostilePair, schedules, world
+from tests.lod_cloud.hostile_link import PLACES, Action, HostilePair, schedules, settled, world
 
 LIMITS = ((256, 1 << 20), (256, 1 << 20), (4, 1 << 20), (256, 40), (1, 1))
 WINDOWS = ((4, 32), (1, 3), (4, 0), (2, 7))
 
 
 BUDGETS = (None, None, 1, 250, 600)
-
-
-def settled(**changes: object) -> HostilePair:
-    """A session in which one message was applied and acknowledged."""
-    pair = HostilePair(world(60, 2), **changes)  # type: ignore[arg-type]
-    for action in (("walk", 1), ("down", 0), ("down", 0), ("up", 0), ("up", 0)):
-        pair.act(action)
-    assert pair.client.applied == 1
-    return pair
 
 
 @dataclasses.dataclass(frozen=True)

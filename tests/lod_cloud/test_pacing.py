@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from gaussians.errors import InputError
 from lod_cloud.byte_budget import RAISED_TAU_PX, ByteBudget
 from lod_cloud.client import Client
 from lod_cloud.cloud import Cloud
-from lod_cloud.codec import PaperCodec
+from lod_cloud.codec import Codec, CompactCodec, PaperCodec
 from lod_cloud.criterion import SearchRequest
 from lod_cloud.cut import is_complete
 from lod_cloud.lod_tree import Int32
@@ -168,6 +169,61 @@ def test_no_message_is_larger_than_the_budget_and_most_are_full() -> None:
     assert taus[0] == RAISED_TAU_PX and taus[-1] == 6.0
 
 
+@pytest.mark.parametrize("train", [PaperCodec.train, CompactCodec.train])
+def test_the_very_first_message_is_full(train: Callable[..., Codec]) -> None:
+    """What it shows of the bytes of a node is not taken into account twice."""
+    codec = train(TREE, 1, words=16)
+    for size in (3000, 8000, 20_000):
+        cloud = Cloud(TREE, codec, search=make_search("flat", HOT), budget_bytes=size)
+        message = cloud.search(NEAR, 0)
+        assert cloud.stats is not None and cloud.stats.pending
+        assert 0.9 * size <= len(message) <= size
+
+
+def test_harmonics_fill_what_nothing_else_needs() -> None:
+    """From nothing: plain while tau is raised, then complete, and those that stayed are completed
+    in the order of their ids, in messages as full as any.
+    """
+    codec = CompactCodec.train(TREE, 1, words=16)
+    cloud, client = Cloud(TREE, codec, search=make_search("flat", HOT), budget_bytes=1500), Client()
+    client.receive(cloud.session_start())
+    rows, frame = [], 0
+    while not rows or rows[-1].pending or rows[-1].tau_px > 6.0 or rows[-1].pending_harmonics:
+        received = client.receive(cloud.search(NEAR, frame))
+        cloud.receive(client.report())
+        assert cloud.stats is not None and received.completed == cloud.stats.completed
+        frame += 4
+        rows.append(cloud.stats)
+        assert len(rows) < 200
+    assert all(row.plain == (row.payloads if row.tau_px == RAISED_TAU_PX else 0) for row in rows)
+    assert all(row.completed == 0 for row in rows if row.pending or row.tau_px > 6.0)
+    completing = [row for row in rows if row.completed]
+    assert len(completing) > 1
+    assert max(row.message_bytes for row in rows) <= 1500
+    assert all(row.message_bytes >= 0.8 * 1500 for row in completing[:-1])
+    whole = Cloud(TREE, codec, search=make_search("flat", HOT), budget_bytes=10**7)
+    assert len(whole.search(NEAR, 0)) and whole.stats and whole.stats.plain == whole.stats.payloads
+    for frame in (4, 8):
+        whole.search(NEAR, frame)
+    assert whole.stats.pending_harmonics == 0
+
+
+@pytest.mark.parametrize(
+    ("sh_degree", "train", "budget"),
+    [(0, CompactCodec.train, 1500), (1, PaperCodec.train, 1500), (1, CompactCodec.train, None)],
+)
+def test_nothing_is_plain_without_layers_or_a_budget(
+    sh_degree: int, train: Callable[..., Codec], budget: int | None
+) -> None:
+    tree = random_tree(400, 8, sh_degree=sh_degree)
+    search = make_search("flat", SearchTree.of(tree))
+    cloud = Cloud(tree, train(tree, 1, words=16), search=search, budget_bytes=budget)
+    for frame in range(4):
+        cloud.search(FAR if frame % 2 else NEAR, frame)
+        assert cloud.stats is not None and cloud.stats.added
+        assert cloud.stats.plain == cloud.stats.pending_harmonics == 0
+
+
 def test_tau_is_raised_at_the_start_and_when_far_behind() -> None:
     pair = HostilePair(world(60, 2), budget=250)
     pair.act(("walk", 1))
@@ -179,17 +235,20 @@ def test_tau_is_raised_at_the_start_and_when_far_behind() -> None:
     for tau, error, expected in behind:
         stats = dataclasses.replace(last, tau_px=tau, pending_error_px=error)
         assert budget.request(request, stats).tau_px == expected, (tau, error)
+        assert budget.raised == (expected == 30.0)
     assert budget.request(request, None).tau_px == 30.0
     coarse = dataclasses.replace(request, tau_px=45.0)
-    assert budget.request(coarse, None) is coarse
+    assert budget.request(coarse, None) is coarse and not budget.raised
 
 
-def test_a_still_camera_is_served_to_the_end_one_event_at_a_time() -> None:
-    pair = HostilePair(world(60, 2), budget=1)
+@pytest.mark.parametrize("compact", [False, True])
+def test_a_still_camera_is_served_to_the_end_one_event_at_a_time(compact: bool) -> None:
+    pair = HostilePair(world(60, 2, compact=compact), budget=1)
     pair.act(("walk", 1))
     pair._deliver_all()
     left = pair.settle()
     assert len(left) > 10 and left[-1] == 0
+    assert (pair.plain > 0, pair.completed > 0) == (compact, compact)
     assert pair.cloud.found is not None
     assert np.array_equal(pair.cloud.table.cut_ids, pair.cloud.found.cut)
 

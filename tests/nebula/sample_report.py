@@ -162,6 +162,7 @@ def _scene() -> dict[str, Any]:
                 "budget_bytes": 555_555,
                 "pending_nodes": [4000, 12, 0],
                 "pending_error_px": [None, 6.5, 0.0],
+                "pending_harmonics": [0, 0, 0],
                 "deferred_bytes": [64_000, 192, 0],
                 "tau_px": [30.0, 6.0, 6.0],
             },

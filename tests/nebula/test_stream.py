@@ -98,6 +98,18 @@ def test_paced_messages_stay_within_the_link_and_end_at_the_same_cut(
     assert all(a["line_s"] <= b["line_s"] for a, b in pairwise(pictures))
 
 
+def test_paced_compact_messages_bring_harmonics_last(tree: Path) -> None:
+    """While tau is raised nodes come without; those that stay get theirs, and the report counts."""
+    paced = stream.run(options(tree=tree, paced=True, rate_mbps=2.0, codec="compact")).data
+    rows, summary = paced["rows"], paced["summary"]
+    assert max(row["message_bytes"] for row in rows) <= paced["budget_bytes"]
+    assert rows[0]["plain"] == rows[0]["payloads"] == rows[0]["pending_harmonics"] > 0
+    assert all(row["plain"] == 0 for row in rows if row["tau_px"] == 6.0)
+    assert all(row["completed"] == 0 for row in rows if row["pending"])
+    assert sum(row["completed"] for row in rows) > 0
+    assert summary["pending_harmonics"] == rows[-1]["pending_harmonics"] == 0
+
+
 def test_a_faulty_line_heals(tree: Path) -> None:
     faulty = stream.run(options(tree=tree, frames=400, loss=0.1, reorder=0.1, corruption=0.05))
     summary = faulty.data["summary"]
