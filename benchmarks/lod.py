@@ -24,7 +24,7 @@ from typing import Any
 
 from benchmarks import lod_targets, machine
 from benchmarks.lod_targets import Verdict
-from benchmarks.tree import build, line
+from benchmarks.tree import build, line, warm_up
 from nebula.config import data_root
 
 HEAD = "traces/eyenavgs/user113_alameda.csv"
@@ -49,6 +49,7 @@ def run(name: str, *arguments: str, report: Path | None = None) -> Any:
 def build_trees(folder: Path, leaves: int) -> Iterator[Verdict]:
     """What is not there yet: the small trees without directional colour, the large ones with it."""
     print("\n## building\n", flush=True)
+    warm_up()
     for kind in ("city", "dense_city"):
         for part, degree in ((4, "0"), (1, "3")):
             out = folder / _name(kind, leaves // part)

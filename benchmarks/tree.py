@@ -60,9 +60,15 @@ def line(name: str, r: dict[str, float]) -> str:
     )
 
 
-def speed() -> None:
+def warm_up() -> None:
+    """Have the kernels of a build compiled."""
     with tempfile.TemporaryDirectory() as folder:
         build(Path(folder) / "warm", "--tiled", "dense_city", "--city-leaves", "20000")
+
+
+def speed() -> None:
+    warm_up()
+    with tempfile.TemporaryDirectory() as folder:
         for degree in ("0", "1", "3"):
             for extra in ((), ("--pair-within", "1"), ("--fan-out-ratio", "0.7")):
                 arguments = ("--tiled", "dense_city", "--city-leaves", "1000000")
