@@ -15,6 +15,7 @@ from lod_cloud.search.wheel import WheelSearch
 
 _TESTS_SHARE = 1 / 128  # of the nodes the last full search tested: what the wheel may test instead
 _FILL_SHARE = 1 / 256  # likewise, the entries that may be made beside a full search
+_PARTS = 64  # at most one of so many of the tree is looked at for them: pages new to the process
 _LEAST = 256
 
 
@@ -67,5 +68,6 @@ class AutoSearch(WheelSearch):
         self._full_tests = tested
         changed = np.concatenate([due, expanded, collapsed])
         self._insert(decisions.active_among(changed, self._ints, self.refined, self._scheduled))
-        self._filled = self._fill(self._filled, max(_LEAST, int(tested * _FILL_SHARE)))
+        end = min(len(self.tree), self._filled + max(_LEAST, len(self.tree) // _PARTS))
+        self._filled = self._fill(self._filled, end, max(_LEAST, int(tested * _FILL_SHARE)))
         return expanded, collapsed, tested, touched + self._touched(len(changed), 0)

@@ -68,7 +68,7 @@ class WheelSearch(Search):
         self.tree.release_groups()  # the wheel reads records
         self._clear()
         self._camera, self._factor = request.camera, request.factor
-        self._fill(0, UNLIMITED)
+        self._fill(0, len(self.tree), UNLIMITED)
         return outcome
 
     def _stream(self, request: SearchRequest) -> tuple[Int32, Int32, int, int]:
@@ -130,11 +130,12 @@ class WheelSearch(Search):
             self._insert(waiting)
         return opened.copy(), closed.copy(), tested
 
-    def _fill(self, begin: int, most: int) -> int:
-        """Schedule active nodes from node ``begin`` on; where to go on."""
+    def _fill(self, begin: int, end: int, most: int) -> int:
+        """Schedule about ``most`` active nodes among begin..end; where to go on."""
         tree = self.tree
         nodes, at = decisions.active_nodes(
             begin,
+            end,
             most,
             tree.first_child,
             tree.child_count,

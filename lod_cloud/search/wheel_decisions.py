@@ -179,23 +179,22 @@ def settle(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def active_nodes(begin, most, first_child, child_count, refined, words, scheduled):  # type: ignore[no-untyped-def]
-    """Active nodes without entry among refined nodes, from node ``begin`` on, and
-    their children, until ``most`` were found; and where to go on. Marks them as scheduled.
+def active_nodes(begin, end, most, first_child, child_count, refined, words, scheduled):  # type: ignore[no-untyped-def]
+    """Active nodes without entry among the refined nodes ``begin``..``end``, and their children,
+    until ``most`` were found; and where to go on. Marks them as scheduled.
 
     ``words`` are the marks ``refined``, 64 at a time.
     """
-    nodes = len(child_count)
-    waiting = np.empty(nodes, np.int32)  # memory is taken by what is written
+    waiting = np.empty(len(child_count), np.int32)  # memory is taken by what is written
     made = 0
     node = begin
     if not is_set(refined, 0):
-        node = nodes
+        node = end = len(child_count)
         if child_count[0] and not is_set(scheduled, 0):
             set_bit(scheduled, 0)
             waiting[made] = 0
             made = 1
-    while node < nodes and made < most:
+    while node < end and made < most:
         if node & 63 == 0 and words[node >> 6] == 0:
             node += 64
             continue
@@ -214,7 +213,7 @@ def active_nodes(begin, most, first_child, child_count, refined, words, schedule
                 waiting[made] = node
                 made += 1
         node += 1
-    return waiting[:made].copy(), min(node, nodes)
+    return waiting[:made].copy(), min(node, end)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

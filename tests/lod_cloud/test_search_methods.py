@@ -200,6 +200,7 @@ def test_auto_takes_back_what_it_gave_up(
     monkeypatch.setattr(auto, "_LEAST", budget)
     monkeypatch.setattr(auto, "_TESTS_SHARE", 0.0)
     monkeypatch.setattr(auto, "_FILL_SHARE", 1.0)
+    monkeypatch.setattr(auto, "_PARTS", 1)
     tree = trees["large binary"]
     searches = [make_search(method, tree) for method in ("flat", "auto")]
     given_up = 0
