@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gaussians import parallel
 from gaussians.errors import InputError
 from gaussians.scene import FIELDS, Scene
 from lod_cloud import build
@@ -18,8 +17,6 @@ from lod_cloud.build import BuildOptions, build_tree
 from lod_cloud.criterion import SearchRequest, prove_nesting
 from lod_cloud.lod_tree import LodTree
 from lod_cloud.merge import merge_leaves
-from lod_cloud.numbering import BLOCK_NODES, number_nodes
-from lod_cloud.split import split_order
 from tests.lod_cloud.trees import random_scene, random_tree
 from tests.naive import lod_merge as naive
 
@@ -161,80 +158,6 @@ def test_needles_keep_their_thin_axis() -> None:
     root = np.sort(build_tree(scene).gaussians.scales[0].astype(float))
     assert root[2] == pytest.approx(100.0, rel=1e-6)
     assert root[:2].max() < 1e-3  # eigenvalues are exact to 1e-16 of the largest one
-
-
-def test_no_number_of_threads_changes_a_bit() -> None:
-    scene = random_scene(5000, 11)
-    before = parallel.threads()
-    try:
-        trees = []
-        for count in (1, 3):
-            parallel.set_threads(count)
-            trees.append(build_tree(scene))
-    finally:
-        parallel.set_threads(before)
-    for name in ("parent", "leaf_id", "radius", "extent"):
-        assert np.array_equal(getattr(trees[0], name), getattr(trees[1], name))
-    for name in FIELDS:
-        assert np.array_equal(*(getattr(t.gaussians, name) for t in trees))
-
-
-@pytest.mark.parametrize("ratio", [1.0, 0.7])
-@pytest.mark.parametrize("threads", [1, 3])
-def test_numbers_are_those_of_a_walk_over_all_levels(ratio: float, threads: int) -> None:
-    """Of levels of more nodes than are numbered at a time, on any number of threads."""
-    scene = random_scene(120_000, 13, sh_degree=0)
-    before = parallel.threads()
-    parallel.set_threads(threads)
-    try:
-        ids = split_order(scene.means, 1)
-        nodes, children = merge_leaves(scene, ids, 1)
-        found = number_nodes(children, 2 * len(scene) - 2, nodes.extent, ratio)
-    finally:
-        parallel.set_threads(before)
-    levels, parents = naive.numbering(children, 2 * len(scene) - 2, nodes.extent, ratio)
-    assert max(map(len, levels)) > 2 * BLOCK_NODES
-    assert found.level_offsets.tolist() == np.cumsum([0, *map(len, levels)]).tolist()
-    assert found.nodes.tolist() == [node for level in levels for node in level]
-    above = [parents[node] for node in found.nodes.tolist()]
-    assert found.parent[0] == -1 and found.nodes[found.parent[1:]].tolist() == above[1:]
-    counts = np.bincount(found.parent[1:], minlength=len(found))
-    assert np.array_equal(found.child_count, counts)
-    firsts = np.where(counts > 0, 1 + np.cumsum(counts) - counts, -1)
-    assert np.array_equal(found.first_child, firsts)
-
-
-@pytest.mark.parametrize("pair_within", [1, 16])
-def test_a_large_scene_has_the_same_bits_on_two_threads(pair_within: int) -> None:
-    """More leaves than are split, merged, numbered or filled with harmonics at a time."""
-    scene = random_scene(150_000, 14, sh_degree=0)
-    before = parallel.threads()
-    try:
-        trees = []
-        for count in (1, 2):
-            parallel.set_threads(count)
-            trees.append(build_tree(scene, options=BuildOptions(pair_within)))
-    finally:
-        parallel.set_threads(before)
-    for name in ("parent", "first_child", "child_count", "leaf_id", "radius", "extent"):
-        assert np.array_equal(getattr(trees[0], name), getattr(trees[1], name))
-    for name in FIELDS:
-        assert np.array_equal(*(getattr(t.gaussians, name) for t in trees))
-
-
-def test_a_scene_may_lie_in_memory_in_any_way() -> None:
-    """Arrays that are columns of another one, and arrays nobody may write to."""
-    scene = random_scene(3000, 15)
-    wanted = build_tree(scene)
-    wide = {f: np.repeat(getattr(scene, f)[..., None], 2, axis=-1)[..., 0] for f in FIELDS}
-    fixed = {f: getattr(scene, f).copy() for f in FIELDS}
-    for array in fixed.values():
-        array.flags.writeable = False
-    for other in (Scene(**wide), Scene(**fixed)):
-        tree = build_tree(other)
-        assert np.array_equal(tree.radius, wanted.radius)
-        for f in FIELDS:
-            assert np.array_equal(getattr(tree.gaussians, f), getattr(wanted.gaussians, f))
 
 
 @given(st.integers(2, 300), st.integers(0, 9999), st.sampled_from([0.01, 10.0, 3000.0]))
