@@ -98,8 +98,8 @@ def scaled(value: Any, exponent: Any) -> Any:
     return value * (bits + np.int32(127 << 23)).view(np.float32)[()]
 
 
-def prefetch(array: Float32, start: SupportsIndex) -> None:
-    """Ask for the cache line of array[start], counted as in `load`; changes no value.
+def prefetch(array: NDArray[Any], start: SupportsIndex) -> None:
+    """Ask for the cache line of array[start], counted as in `load`, of any type; changes no value.
 
     Of an array that is not contiguous it asks for the wrong line, which costs time only.
     """
@@ -136,8 +136,8 @@ def _implement(function: Any, result: Any, *arguments: Any) -> Callable[[Emit], 
     def fits(given: Any, wanted: Any) -> bool:
         if wanted is not types.Array:
             return bool(given == wanted)
-        flat = function is prefetch or getattr(given, "layout", "") == "C"
-        return isinstance(given, types.Array) and given.dtype == _NUMBER and flat
+        numbers = getattr(given, "layout", "") == "C" and given.dtype == _NUMBER
+        return isinstance(given, types.Array) and (numbers or function is prefetch)
 
     class Typing(AbstractTemplate):
         key = function

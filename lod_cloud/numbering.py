@@ -90,13 +90,12 @@ def _expand(  # type: ignore[no-untyped-def]
     """
     leaves = len(children) + 1
     keeps_all = ratio >= np.float32(1.0)
-    pairs = children.view(np.float32)  # which is what can be asked for
     waiting = np.empty(_MOST_LEVELS, np.int32)
     for block in range(first, last):
         free = places[block] if number_them else 0
         low = begin + block * BLOCK_NODES
         for number in range(low, min(low + BLOCK_NODES, end)):
-            prefetch(pairs, 2 * (np.int64(nodes[min(number + _AHEAD, end - 1)]) - leaves))
+            prefetch(children, 2 * (np.int64(nodes[min(number + _AHEAD, end - 1)]) - leaves))
             node, before = nodes[number], free
             depth = 0
             if keeps_all and not number_them:

@@ -7,14 +7,13 @@ from typing import Any, ClassVar
 import numpy as np
 from numba import njit
 
-from gaussians.lanes import highest_bit, lowest_bit
+from gaussians.lanes import highest_bit, lowest_bit, prefetch
 from gaussians.parallel import run_chunks
 from lod_cloud.criterion import SearchRequest
 from lod_cloud.lod_tree import Int32
 from lod_cloud.search.flat import BYTES_PER_TEST
 from lod_cloud.search.interface import FullSearch
 from lod_cloud.search.marks import test_group
-from lod_cloud.search.prefetching import prefetch
 from lod_cloud.search.search_tree import Marks
 from lod_cloud.search_arrays import GROUP, GROUP_NUMBERS, GROUP_ROWS
 

@@ -31,8 +31,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from gaussians.lanes import prefetch
 from lod_cloud.search.marks import ONE
-from lod_cloud.search.prefetching import BATCH, gather, prefetch
+from lod_cloud.search.prefetching import BATCH, gather
 from lod_cloud.search.sectors import SECTORS, reach, sector_of
 
 KAPPA, MU = 0.1, 0.05

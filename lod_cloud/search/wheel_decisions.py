@@ -10,8 +10,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from gaussians.lanes import prefetch
 from lod_cloud.search.marks import any_set, clear_bit, is_set, set_bit, stays_refined
-from lod_cloud.search.prefetching import BATCH, gather, prefetch
+from lod_cloud.search.prefetching import BATCH, gather
 from lod_cloud.search.wheel_buckets import ENTRIES, chunks_for, find_keys, put
 from lod_cloud.search_arrays import CHILD_COUNT, FIRST_CHILD, PARENT, RECORD_COLUMNS
 
