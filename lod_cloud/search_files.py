@@ -24,7 +24,7 @@ from lod_cloud.search_arrays import (
 
 SEARCH_FILES = ("search_groups", "search_records")  # arrays on disk, as in `SearchArrays`
 _SOURCES = ("means", "radius", "extent", "child_count", "first_child", "parent")
-_BLOCK_NODES = GROUP << 12
+_BLOCK_NODES = GROUP << 14  # 8 MB of records: what is written so is cached in pages of 2 MB
 
 
 def search_array_shapes(nodes: int) -> tuple[tuple[int, ...], tuple[int, ...]]:

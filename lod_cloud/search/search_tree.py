@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gaussians.errors import InputError
 from gaussians.parallel import run_chunks
-from lod_cloud.array_file import release_pages
+from lod_cloud.array_file import advise_huge_pages, release_pages
 from lod_cloud.lod_tree import Float32, Int32
 from lod_cloud.search.marks import set_bit
 from lod_cloud.search_arrays import (
@@ -121,6 +121,7 @@ class SearchTree:
         """
         if self.stored is not None:
             records = self.stored.records
+            advise_huge_pages(records)
         else:
             records = aligned(len(self), RECORD_COLUMNS)
             run_chunks(self._put_records, -(-len(self) // (_CHUNK * GROUP)), records)

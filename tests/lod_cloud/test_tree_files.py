@@ -260,6 +260,25 @@ def test_released_pages_come_back(tmp_path: Path) -> None:
     SearchTree.of(random_tree(5, 3)).release_groups()  # nothing is mapped
 
 
+@pytest.mark.skipif(
+    not Path("/sys/kernel/mm/transparent_hugepage").exists(), reason="needs a Linux with huge pages"
+)
+def test_stored_records_may_be_mapped_in_huge_pages(tmp_path: Path) -> None:
+    save_tree(random_tree(5, 3), tmp_path / "tree")
+    tree = SearchTree.of(load_tree(tmp_path / "tree"))
+    file = tmp_path / "tree" / "search_records.npy"
+    assert "hg" not in _mapping_flags(file)
+    records, _ = tree.records
+    assert "hg" in _mapping_flags(file)
+    assert np.array_equal(records, SearchTree.of(random_tree(5, 3)).records[0], equal_nan=True)
+
+
+def _mapping_flags(file: Path) -> list[str]:
+    """VmFlags of the mapping of a file (proc(5))."""
+    mappings = Path("/proc/self/smaps").read_text().partition(str(file))[2]
+    return mappings.partition("VmFlags:")[2].partition("\n")[0].split()
+
+
 def test_a_spool_is_filled_exactly(tmp_path: Path) -> None:
     with LeafSpool(tmp_path, 10, 1) as spool:
         spool.append(random_scene(6, 1))
