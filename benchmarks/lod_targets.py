@@ -15,6 +15,9 @@ STREET_ADDS_PER_M = 30_000
 METRES_PER_FRAME = 1.4 / 90  # walking
 FLAT_NS_PER_NODE = 3.5  # slower than this the baseline would flatter everything else
 GROWTH = 1.3
+# Most of what changes lies inside the smaller sparse city then, as it did when the target was set:
+# changes grew 1.05 to 1.23 times. A street of 5 M leaves, 153 m of it, ends in sight at any tau.
+GROWTH_TAU_PX = 15.0
 WORST_OF_STREAMING = 1.5
 FULL_SIZE = 20_000_000  # leaves of the trees the rates are meant for
 RATES_MBPS = {"city, walk": 1.3, "dense_city, walk": 12.0, "dense_city, head": 0.5}
@@ -125,9 +128,16 @@ def teleport_verdicts(place: Place, streaming: Row, auto: Row) -> Iterator[Verdi
         yield Verdict(text, value, WORST_OF_STREAMING)
 
 
-def growth_verdict(first: str, last: str, times: list[float]) -> Verdict:
-    """Of the wheel from a tree to a larger one at the same view."""
-    return Verdict(f"growth of wheel from {first} to {last}", times[-1] / times[0], GROWTH)
+def growth_verdicts(place: Place, last: str, row: Row) -> Iterator[Verdict]:
+    """Of the wheel from a tree to a larger one at the same views: per change, and as it is where
+    the tree is large enough.
+    """
+    if place.leaves_m <= 4:
+        return
+    what = f"{place.name} to {last}, w = {row['every']}, tau {row['tau_px']:g} px"
+    yield Verdict(f"growth of wheel per change, {what}", row["time per change"], GROWTH)
+    if row["tau_px"] == GROWTH_TAU_PX and not place.street:
+        yield Verdict(f"growth of wheel, {what}", row["time"], GROWTH)
 
 
 def build_verdicts(name: str, built: Row) -> Iterator[Verdict]:

@@ -6,9 +6,10 @@
 Prints Markdown: per tree the walk at w = 4 by all methods on one thread, with ratios to the flat
 scan and to the Octree-GS rule; the walk at w = 1 and a recorded head by the wheel; teleports by
 `auto` and `streaming`; `streaming` on two threads; the wheel's growth from the first tree to the
-last, on a walk from the middle of the first. Then every number that has a target, PASSED or
-FAILED. Methods that take longer than a streamed search make 110 searches, of which 100 count, the
-others 460. Run it on a quiet machine: the load average stands in the first line.
+last, on a walk from the middle of the first, beside that of the changes it finds. Then every number
+that has a target, PASSED or FAILED. Methods that take longer than a streamed search make 110
+searches, of which 100 count, the others 460. Run it on a quiet machine: the load average stands in
+the first line.
 """
 
 from __future__ import annotations
@@ -174,6 +175,20 @@ def on_two_threads(subject: Subject, requests: Sequence[SearchRequest], every: i
     return measured
 
 
+def _growth(small: dict[str, Any], large: dict[str, Any]) -> dict[str, float]:
+    """From row to row: CPU milliseconds, and what they are spent on."""
+    times = [row["cpu_p50_ms"] for row in (small, large)]
+    changes = [row["adds_mean"] + row["removes_mean"] for row in (small, large)]
+    return {
+        "ms, small": times[0],
+        "ms, large": times[1],
+        "time": times[1] / times[0],
+        "changes": changes[1] / changes[0],
+        "cut": large["cut_size_mean"] / small["cut_size_mean"],
+        "time per change": times[1] / times[0] * changes[0] / changes[1],
+    }
+
+
 class Report:
     """Lines, rows and verdicts of a run."""
 
@@ -207,22 +222,33 @@ class Report:
         )
         requests = subject.requests(WALK, every, self._tau_px, SLOW_SEARCHES)
         two = on_two_threads(subject, requests, every)
-        self._keep(subject, WALK, every, {"streaming": two})
+        self._keep(subject, WALK, every, self._tau_px, {"streaming": two})
         self.verdicts += lod_targets.two_thread_verdicts(place, two.row)
 
     def growth(self, first: Subject, last: Subject, intervals: Sequence[int]) -> None:
-        """How the wheel grows from a tree to a larger one that contains it, at the same views."""
-        for every in intervals:
-            inside = replace(first, view=first.middle)  # as far from its edge as can be
-            requests = inside.requests(WALK, every, self._tau_px, self._searches)
-            name = f"{WALK} in the middle of {first.name}"
-            times = []
-            for subject in (first, last):
-                found = self._compared(subject, name, requests, every, ["wheel"], False)
-                times.append(found["wheel"].row["cpu_p50_ms"])
-            self.verdicts.append(
-                lod_targets.growth_verdict(first.name, f"{last.name}, w = {every}", times)
-            )
+        """How the wheel grows from a tree to a larger one that contains it, at the same views: at
+        the tau of the report, and at the one it is judged at.
+        """
+        inside = replace(first, view=first.middle)  # as far from its edge as can be
+        name = f"{WALK} in the middle of {first.name}"
+        rows = []
+        street = False
+        for tau_px in sorted({self._tau_px, lod_targets.GROWTH_TAU_PX}):
+            for every in intervals:
+                requests = inside.requests(WALK, every, tau_px, self._searches)
+                small, large = (
+                    self._compared(subject, name, requests, every, ["wheel"], False)["wheel"].row
+                    for subject in (first, last)
+                )
+                row = {"tau_px": tau_px, "every": every} | _growth(small, large)
+                street = street or lod_targets.is_street(small, every)
+                place = Place(first.name, len(first.tree), street)
+                self.verdicts += lod_targets.growth_verdicts(place, last.name, row)
+                rows.append(row)
+        self.lines += [f"### Wheel, from {first.name} to {last.name}, {name}", ""]
+        self.lines += [f"| {' | '.join(rows[0])} |", f"|---|{'---:|' * (len(rows[0]) - 1)}"]
+        self.lines += [f"| {' | '.join(f'{v:.3g}' for v in row.values())} |" for row in rows]
+        self.lines.append("")
 
     def _section(
         self, subject: Subject, trace: str, every: int, methods: Sequence[str], everything: bool
@@ -244,15 +270,17 @@ class Report:
         if everything:
             found |= rules(subject, requests, every)
         self.lines += [
-            f"### {subject.name}, {name}, w = {every}, tau {self._tau_px:g} px, one thread",
+            f"### {subject.name}, {name}, w = {every}, tau {requests[0].tau_px:g} px, one thread",
             "",
             *table(subject, found),
         ]
-        self._keep(subject, name, every, found)
+        self._keep(subject, name, every, requests[0].tau_px, found)
         return found
 
-    def _keep(self, subject: Subject, trace: str, every: int, found: dict[str, Measured]) -> None:
-        setting = {"tree": subject.name, "trace": trace, "every": every, "tau_px": self._tau_px}
+    def _keep(
+        self, subject: Subject, trace: str, every: int, tau_px: float, found: dict[str, Measured]
+    ) -> None:
+        setting = {"tree": subject.name, "trace": trace, "every": every, "tau_px": tau_px}
         self.rows += [setting | measured.row for measured in found.values()]
 
 
