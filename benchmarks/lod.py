@@ -94,9 +94,12 @@ def stream(folder: Path, leaves: int, heads: Sequence[str]) -> Iterator[Verdict]
         yield from lod_targets.rate_verdicts("dense_city, head", leaves, found)
 
 
-def loss(folder: Path, real: bool) -> Iterator[Verdict]:
-    """What decoding loses: the generated city, and real scenes where they are."""
+def loss(folder: Path, leaves: int, real: bool) -> Iterator[Verdict]:
+    """What decoding loses: generated cities, and real scenes where they are."""
     scenes: dict[str, tuple[str, ...]] = {"city of 60000": ("--city", "60000")}
+    for kind in ("city", "dense_city"):
+        tree = str(folder / _name(kind, leaves))
+        scenes[kind] = ("--tree", tree, "--codec", lod_targets.HELD_TO_IT)
     if real:
         scenes["PLAYBOT"] = (
             *("--scene", str(data_root() / PLAYBOT), "--level", "1"),
@@ -148,7 +151,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "search": lambda: search(given.folder, given.leaves, heads),
         "memory": lambda: memory(dense),
         "stream": lambda: stream(given.folder, given.leaves, heads),
-        "loss": lambda: loss(given.folder, real),
+        "loss": lambda: loss(given.folder, given.leaves, real),
         "picture": lambda: picture(dense),
     }
     if real:

@@ -3,11 +3,13 @@
     python -m benchmarks.stream rate --tree DIR --trace walk --every 4 --hysteresis 0
     python -m benchmarks.stream loss --scene FILE --up=-y --units-per-metre 1 --tau 6
     python -m benchmarks.stream loss --city 200000
+    python -m benchmarks.stream loss --tree DIR --codec compact-2048x1
 
 ``rate`` follows a trace through a tree, which may be mapped, after the first cut is there: Mbps at
 90 Hz, bytes by kind of field, escapes, share merged by the client, message sizes, coding time. The
 first cut is not coded and every message counts as acknowledged. ``loss`` renders the cut of three
-views, decoded and not, field by field, and what a client holds after a walk from view to view.
+views, decoded and not, field by field, and (but in a ``--tree``, which may be large) what a client
+holds after a walk from view to view.
 """
 
 from __future__ import annotations
@@ -153,8 +155,11 @@ class Pictures:
 
     @classmethod
     def of(cls, tree: LodTree, rigs: list[StereoRig], tau_px: float) -> Pictures:
-        leaves = tree.gaussians.take(np.sort(tree.leaf_nodes()))
-        full = [render_mono(leaves, rig)[0] for rig in rigs]
+        leaves = np.sort(tree.leaf_nodes())
+        full = [
+            render_mono(tree.gaussians.take(leaves[_in_sight(tree, leaves, rig)]), rig)[0]
+            for rig in rigs
+        ]
         return cls(tree, rigs, tau_px, full, SearchTree.of(tree))
 
     def request(self, rig: StereoRig) -> SearchRequest:
@@ -174,18 +179,32 @@ class Pictures:
         return _in_words(self.psnr_db(scenes, against))
 
 
+def _in_sight(tree: LodTree, nodes: Int32, rig: StereoRig) -> Int32:
+    """Places of the nodes that may show: spheres twice as large as 3 sigma reach into the view."""
+    x, y, z = ((tree.gaussians.means[nodes] - rig.pose.position) @ rig.pose.rotation).T
+    reach = 2.0 * tree.radius[nodes]
+    display = rig.display
+    seen = z > -reach
+    for aside, side in ((x, display.width / display.fx), (y, display.height / display.fy)):
+        seen &= np.abs(aside) - 0.5 * side * z <= np.hypot(1.0, 0.5 * side) * reach
+    return np.flatnonzero(seen).astype(np.int32)
+
+
 def _in_words(values: Sequence[float]) -> str:
     return f"{np.mean(values):6.2f} ({' '.join(f'{v:.1f}' for v in values)})"
 
 
 def loss(
-    pictures: Pictures, codecs: dict[str, Codec], *, fields: bool
+    pictures: Pictures, codecs: dict[str, Codec], *, fields: bool, walk: bool
 ) -> dict[str, dict[str, float]]:
-    """Prints PSNR in dB; with ``fields`` of every field alone, too. Returns means by codec."""
+    """Prints PSNR in dB; with ``fields`` of every field alone, too, with ``walk`` after one.
+    Returns means by codec.
+    """
     tree = pictures.tree
     rows: dict[str, dict[str, float]] = {}
     cuts = [flat_search(tree, pictures.request(rig)).node_ids for rig in pictures.rigs]
-    originals = [tree.gaussians.take(cut) for cut in cuts]
+    seen = [_in_sight(tree, cut, rig) for cut, rig in zip(cuts, pictures.rigs, strict=True)]
+    originals = [tree.gaussians.take(cut[places]) for cut, places in zip(cuts, seen, strict=True)]
     images = [
         render_mono(scene, rig)[0] for scene, rig in zip(originals, pictures.rigs, strict=True)
     ]
@@ -195,10 +214,10 @@ def loss(
     for name, codec in codecs.items():
         encoder = TreeEncoder(tree, codec)
         decoded, escapes = [], 0
-        for cut in cuts:
+        for cut, places in zip(cuts, seen, strict=True):
             coded = encoder.encode(cut)
             escapes += coded.escapes
-            decoded.append(codec.decode(coded.payload).gaussians)
+            decoded.append(codec.decode(coded.payload).gaussians.take(places))
         print(f"{name}: escapes {escapes / sum(len(cut) for cut in cuts):.2%}")
         cut_db = pictures.psnr_db(decoded, images)
         leaves_db = pictures.psnr_db(decoded, pictures.full)
@@ -210,6 +229,7 @@ def loss(
             print(f"    against all leaves          {pictures.score(bare, pictures.full)}")
         rows[name] = {
             "decoded_vs_cut_db": float(np.mean(cut_db)),
+            "worst_view_db": float(np.min(cut_db)),
             "decoded_vs_leaves_db": float(np.mean(leaves_db)),
             "lost_vs_leaves_db": float(np.mean(whole) - np.mean(leaves_db)),
         }
@@ -221,6 +241,8 @@ def loss(
             ]
             if some != ("above",) or tree.sh_degree:
                 print(f"    {label:12} alone          {pictures.score(mixed, images)}", flush=True)
+        if not walk:
+            continue
         walked, stats = _walked(pictures, encoder)
         print(
             f"  after a walk, {stats['merged']:.1%} of the cut merged by the client:"
@@ -274,7 +296,6 @@ def _walked(pictures: Pictures, encoder: TreeEncoder) -> tuple[list[Scene], dict
     client = Client()
     client.receive(cloud.session_start())
     scenes, merged, frame = [], [], 0
-    canonical = encoder.codec.decode(encoder.encode(np.arange(len(tree), dtype=np.int32)).payload)
     here = np.array(pictures.request(pictures.rigs[-1]).position)
     for rig in pictures.rigs:
         target = pictures.request(rig)
@@ -288,9 +309,9 @@ def _walked(pictures: Pictures, encoder: TreeEncoder) -> tuple[list[Scene], dict
         assert client.table is not None
         cut = client.table.cut_ids
         scene = client._subgraph.records(cut).gaussians
-        right = canonical.gaussians.take(cut)
-        merged.append(float((scene.means != right.means).any(axis=1).mean()))
-        scenes.append(scene)
+        sent = encoder.codec.decode(encoder.encode(cut).payload).gaussians
+        merged.append(float((scene.means != sent.means).any(axis=1).mean()))
+        scenes.append(scene.take(_in_sight(tree, cut, rig)))
         here = there
     return scenes, {"merged": float(np.mean(merged))}
 
@@ -298,14 +319,18 @@ def _walked(pictures: Pictures, encoder: TreeEncoder) -> tuple[list[Scene], dict
 # ---------------------------------------------------------------- command line
 
 
-def _codec(name: str, tree: LodTree, bits: tuple[int, int]) -> Codec:
+def _codec(name: str, tree: LodTree, options: argparse.Namespace) -> Codec:
     """``paper`` or, for example, ``compact-256x2``."""
     if name == "paper":
         return PaperCodec.train(tree, 0)
     words, stages = (int(number) for number in name.removeprefix("compact-").split("x"))
-    position, colour = bits
     return CompactCodec.train(
-        tree, 0, words=words, stages=stages, position_bits=position, colour_bits=colour
+        tree,
+        0,
+        words=words,
+        stages=stages,
+        position_bits=options.position_bits,
+        colour_bits=options.colour_bits,
     )
 
 
@@ -314,9 +339,10 @@ def _poses(arguments: argparse.Namespace) -> tuple[LodTree, list[Pose]]:
     if arguments.city:
         city = generate_city(arguments.city, 0, sh_degree=3)
         tree = build_tree(city.scene, up=(0.0, 0.0, 1.0))
-        path = [np.array(point) for point in city.path]
-        places = [len(path) * part // 4 for part in (0, 1, 2)]
-        views = [(path[place], path[place + 1]) for place in places]
+        views = _along([np.array(point) for point in city.path])
+    elif arguments.tree:
+        tree = load_tree(arguments.tree)
+        views = _along([np.array(point) for point in tree.metadata.path])
     else:
         scene, _ = load_scene(arguments.scene, arguments.level)
         tree = build_tree(scene.scaled(1 / arguments.units_per_metre))
@@ -325,6 +351,11 @@ def _poses(arguments: argparse.Namespace) -> tuple[LodTree, list[Pose]]:
         ]
     up = {"+z": (0.0, 0.0, 1.0), "-y": (0.0, -1.0, 0.0)}[arguments.up]
     return tree, [look_at(eye, target, np.array(up)) for eye, target in views]
+
+
+def _along(path: list[Any]) -> list[tuple[Any, Any]]:
+    """Three views on a path, each to its next point."""
+    return [(path[place], path[place + 1]) for place in (0, len(path) // 4, len(path) // 2)]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -354,15 +385,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     parallel.set_threads(1)
     print(in_words(describe()))
-    bits = options.position_bits, options.colour_bits
-    names = options.codec or ["paper", "compact-256x2", "compact-4096x2", "compact-512x4"]
+    names = options.codec or ["paper", "compact-256x1", "compact-2048x1", "compact-512x2"]
     if options.what == "loss":
         tree, poses = _poses(options)
         display = Display.from_fov(options.size, options.size, 90.0)
         rigs = [StereoRig(display, pose, 0.0, options.near) for pose in poses]
         pictures = Pictures.of(tree, rigs, options.tau)
-        codecs = {name: _codec(name, tree, bits) for name in names}
-        rows = loss(pictures, codecs, fields=options.fields)
+        codecs = {name: _codec(name, tree, options) for name in names}
+        rows = loss(pictures, codecs, fields=options.fields, walk=not options.tree)
         if options.json:
             options.json.write_text(json.dumps(rows, indent=1))
         return
@@ -373,7 +403,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     rates: dict[str, Any] = {}
     for name in names:
-        codec = _codec(name, tree, bits)
+        codec = _codec(name, tree, options)
         rates[name] = rate(
             subject, tree, codec, requests, options.every, options.hysteresis, options.window
         )

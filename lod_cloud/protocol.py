@@ -15,7 +15,7 @@ import zstandard
 from gaussians.errors import InputError
 
 MAGIC = b"NB"
-VERSION = 4
+VERSION = 5
 SESSION_START = 1
 DELTA_CUT = 2
 PROBE = 3

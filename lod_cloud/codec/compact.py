@@ -7,10 +7,11 @@ Field, coding, largest error:
   deviation
 * scales: the largest of the three as a logarithm over the tree's range, the others as 8-bit
   logarithms of their ratio to it, 2^-12 to 1 (what is smaller is coded as 0); `LogField.max_ratio`
-* rotation: smallest three, 3 x 8 bit and a 2-bit index, of the axes ordered by scale; 0.02 rad
+* rotation: smallest three, 3 x 7 bit and a 2-bit index, of the axes ordered by scale; 0.04 rad
 * opacity: logarithm over the tree's range, 0 exactly
 * SH degree 0: `colour_bits` each, linear over the tree's range
-* SH above: words of a residual codebook; 1 per coefficient
+* SH above: words of a residual codebook; 1 per coefficient. Of leaves also what these leave over,
+  in even steps; half a step
 * R, e of interior nodes: 4-bit logarithm, rounded up, of their ratio to what follows from the
   decoded scales
 * id, parent, number of children: exact
@@ -37,6 +38,7 @@ from numpy.typing import NDArray
 from gaussians.codebook import Codebook
 from gaussians.compression import UInt16
 from gaussians.errors import InputError
+from lod_cloud.codec.harmonic_rests import HarmonicRests
 from lod_cloud.codec.harmonic_words import HarmonicWords
 from lod_cloud.codec.interface import Encoded, Neighbours, References
 from lod_cloud.codec.node_columns import Layout, Rows
@@ -79,6 +81,7 @@ class CompactCodec:
     merge_levels: int  # of a tree whose interior nodes are merges; 0 of any other
     fields: NodeFields
     codebook: Codebook | None  # None exactly for SH degree 0
+    rests: HarmonicRests | None  # likewise
     tables: Tables  # by the keys of `lod_cloud.codec.node_columns`
 
     def __post_init__(self) -> None:
@@ -93,8 +96,8 @@ class CompactCodec:
         tree: LodTree,
         seed: int,
         *,
-        words: int = 512,
-        stages: int = 4,
+        words: int = 2048,
+        stages: int = 1,
         position_bits: int = 6,
         colour_bits: int = 7,
     ) -> CompactCodec:
@@ -109,8 +112,10 @@ class CompactCodec:
         codebook = train_codebook(tree, seed, words, stages)
         levels = tree.levels if tree.metadata.build.get("merge") == RULE else 0
         tolerance = merge_tolerance(fields.position.max_error, levels)
-        tables = count_tables(tree, drawn_nodes(tree, seed), fields, codebook, tolerance)
-        return cls(tree.sh_degree, levels, fields, codebook, tables)
+        drawn = drawn_nodes(tree, seed)
+        more = HarmonicRests.train(tree, drawn, codebook) if codebook else None
+        tables = count_tables(tree, drawn, fields, codebook, more, tolerance)
+        return cls(tree.sh_degree, levels, fields, codebook, more, tables)
 
     @cached_property
     def layout(self) -> Layout:
@@ -120,7 +125,9 @@ class CompactCodec:
     @cached_property
     def apart(self) -> HarmonicWords | None:
         """How harmonics above degree 0 travel alone; None without any."""
-        return HarmonicWords(self.codebook, self.layout, self.tables) if self.codebook else None
+        if self.codebook is None or self.rests is None:
+            return None
+        return HarmonicWords(self.codebook, self.rests, self.layout, self.tables)
 
     @property
     def merges(self) -> bool:
@@ -156,6 +163,7 @@ class CompactCodec:
             "sh_degree": self.sh_degree,
             "merge_levels": self.merge_levels,
             **self.fields.parameters,
+            "harmonic_step": self.rests.step if self.rests else None,
             "frequencies": {key: found.table.tolist() for key, found in self.tables.items()},
         }
         return pack(parameters, self.codebook)
@@ -166,11 +174,15 @@ class CompactCodec:
         fields = NodeFields.of(p)
         keys = layout_of(fields, codebook).shapes()
         tables = {key: Frequencies.of(p["frequencies"][key]) for key in keys}
-        return cls(p["sh_degree"], int(p["merge_levels"]), fields, codebook, tables)
+        rests = HarmonicRests(p["harmonic_step"]) if codebook else None
+        return cls(p["sh_degree"], int(p["merge_levels"]), fields, codebook, rests, tables)
 
     def assign_words(self, tree: LodTree, ids: Int32) -> tuple[UInt16, Mask]:
-        """Codebook words [N, stages] of nodes, and whether they are near enough; costly."""
-        return words_of(tree, ids, self.codebook)
+        """Codebook words [N, stages] of nodes, and whether they are near enough, which they are of
+        no leaf; costly.
+        """
+        words, near = words_of(tree, ids, self.codebook)
+        return words, near & (tree.child_count[ids] > 0) if self.codebook else near
 
     # ------------------------------------------------------------ encoding
 
@@ -200,7 +212,8 @@ class CompactCodec:
         writer.plain(nodes.float32_rows(np.flatnonzero(exact), coefficients=1))
         above = None if plain else self.apart
         if above:
-            above.write_far(writer, near, harmonics(nodes.gaussians, np.flatnonzero(~near)))
+            numbers = harmonics(nodes.gaussians, np.flatnonzero(~near))
+            told = above.write_far(writer, words, near, numbers, inner)
         rows, pusher = (
             Rows.of(inner, nodes.parents, references.ids if references else None),
             Pusher(),
@@ -208,13 +221,14 @@ class CompactCodec:
         given = codes.columns(kept, inner, self.layout.colours) | {"position": choices}
         self.layout.fields(pushing(pusher, self.tables), rows.take(kept), given)
         if above:
-            above.push(pusher, words[near], inner[near])
+            above.push(pusher, words[told.by_words], inner[told.by_words], told)
         pusher.write(writer)
         writer.begin("position")
         self.fields.position.write(writer, where[0], choices)
         if above:
-            above.write_low(writer, words[near])
-        escapes = int(np.count_nonzero(exact | ~near if above else exact))
+            above.write_low(writer, words[told.by_words])
+            exact |= ~told.by_words
+        escapes = int(np.count_nonzero(exact))
         return Encoded(writer.bytes(), len(nodes), escapes, writer.sizes)
 
     # ------------------------------------------------------------ decoding
@@ -241,13 +255,13 @@ class CompactCodec:
         sh = np.zeros((count, (self.sh_degree + 1) ** 2, 3), np.float32)
         above = None if plain else self.apart
         if above:
-            numbers, near = above.read_far(reader, count)
+            numbers, by_words = above.read_far(reader, count)
         known, puller = (
             Rows.of(inner, parents, references.ids if references else None),
             Puller(reader),
         )
         values = self.layout.fields(pulling(puller, self.tables), known.take(kept), None)
-        words = above.pull(puller, inner[near]) if above else {}
+        words = above.pull(puller, inner[by_words]) if above else {}
         puller.finish()
         sigmas = self.fields.sigmas(values)
         choices = values["position"].astype(np.int64)
@@ -255,7 +269,7 @@ class CompactCodec:
         whole = self.fields.position.read(reader, choices, sigmas[:, 0], held)
         gaussians = self.fields.decode(values, sigmas, whole)
         if above:
-            above.read_low(reader, words, numbers, near)
+            numbers[by_words] = above.read_low(reader, words, inner[by_words])
             sh[:, 1:] = numbers.reshape(sh[:, 1:].shape)
         reader.finish()
         spheres = np.zeros((len(gaussians), 2), np.float32)

@@ -9,17 +9,19 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from lod_cloud.codec.harmonic_rests import RESTS
 from lod_cloud.codec.positions import CHOICES
 from lod_cloud.codec.rans import MOST_SYMBOLS
-from lod_cloud.codec.shapes import BYTE, SPHERE, WIDE
+from lod_cloud.codec.shapes import BYTE, ROTATION, SPHERE, WIDE
 
 Mask = NDArray[np.bool_]
 Column = NDArray[Any]  # [N] whole numbers
 
 _AXES = 4
-_BYTES = BYTE + 1
+_BYTES, _TURNS = BYTE + 1, ROTATION + 1
 _MOST_BITS = MOST_SYMBOLS.bit_length() - 1
-_COARSE = 8  # contexts that a byte gives, by its three highest bits
+_DEGREES = 3
+_COARSE = 8  # contexts that a code gives, by its three highest bits
 
 
 class Coder(Protocol):
@@ -85,11 +87,16 @@ class _Columns:
         inner = self._inner
         self.stepped("scale.0", WIDE + 1)
         ratio = self.plain("scale.1", _BYTES, inner, 2)
-        self.plain("scale.2", _BYTES, inner + 2 * _coarse(ratio), 2 * _COARSE)
+        self.plain("scale.2", _BYTES, inner + 2 * _coarse(ratio, _BYTES), 2 * _COARSE)
         axis = self.plain("rotation.axis", _AXES, inner, 2)
-        one = self.plain("rotation.0", _BYTES, inner + 2 * axis, 2 * _AXES)
-        two = self.plain("rotation.1", _BYTES, _coarse(one) + _COARSE * axis, _COARSE * _AXES)
-        self.plain("rotation.2", _BYTES, _coarse(two) + _COARSE * axis, _COARSE * _AXES)
+        one = self.plain("rotation.0", _TURNS, inner + 2 * axis, 2 * _AXES)
+        two = self.plain("rotation.1", _TURNS, self._turned(one, axis), _COARSE * _AXES)
+        self.plain("rotation.2", _TURNS, self._turned(two, axis), _COARSE * _AXES)
+
+    @staticmethod
+    def _turned(before: Column, axis: Column) -> Column:
+        """Contexts that the component before gives."""
+        return _coarse(before, _TURNS) + _COARSE * axis
 
     def look(self, colours: int) -> None:
         """Opacity, and green and what red and blue differ from it by."""
@@ -113,13 +120,14 @@ class Layout:
 
     colours: int  # codes of a channel
     words: tuple[tuple[int, int], ...]  # of every stage: symbols, lowest bits that are none
+    dimensions: int  # coefficients above degree 0
 
     @classmethod
-    def of(cls, colours: int, sizes: Sequence[int]) -> Layout:
+    def of(cls, colours: int, sizes: Sequence[int], dimensions: int) -> Layout:
         """For stages of so many words; the lowest bits of large numbers travel as they are."""
         lows = [max(0, (size - 1).bit_length() - _MOST_BITS) for size in sizes]
         split = [(((size - 1) >> low) + 1, low) for size, low in zip(sizes, lows, strict=True)]
-        return cls(colours, tuple(split))
+        return cls(colours, tuple(split), dimensions)
 
     def high_parts(self, words: NDArray[np.uint16]) -> dict[str, Column]:
         """What of words [N, stages] are symbols."""
@@ -139,12 +147,19 @@ class Layout:
     def harmonics(
         self, code: Coder, inner: Mask, given: Mapping[str, Column] | None
     ) -> dict[str, Column]:
-        """Words of nodes, one column for each stage of the codebook."""
+        """Words of nodes, one column for each stage of the codebook; and what they leave over of
+        every coefficient of leaves, by its degree.
+        """
         values = {}
         for stage, (symbols, _) in enumerate(self.words):
             key = f"harmonics.{stage}"
             known = None if given is None else given[key]
             values[key] = code(key, (2, symbols), inner.astype(np.int64), known)
+        if self.words:
+            degrees = np.sqrt(np.arange(self.dimensions) // 3 + 1).astype(np.int64)  # 1, 2, 3
+            key, known = "harmonics.rest", None if given is None else given["harmonics.rest"]
+            contexts = np.tile(degrees - 1, int(np.count_nonzero(~inner)))
+            values[key] = code(key, (_DEGREES, RESTS), contexts, known)
         return values
 
     def shapes(self) -> dict[str, tuple[int, int]]:
@@ -161,5 +176,5 @@ class Layout:
         return shapes
 
 
-def _coarse(values: Column) -> Column:
-    return values // (_BYTES // _COARSE)
+def _coarse(values: Column, symbols: int) -> Column:
+    return values // (symbols // _COARSE)

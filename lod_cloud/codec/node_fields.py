@@ -15,7 +15,7 @@ from gaussians.scene import Scene
 from lod_cloud.codec.axes import sorted_axes
 from lod_cloud.codec.node_columns import Column
 from lod_cloud.codec.positions import PositionSteps
-from lod_cloud.codec.shapes import BYTE, WIDE, ShapeFields, surface
+from lod_cloud.codec.shapes import ROTATION, WIDE, ShapeFields, surface
 from lod_cloud.codec.tolerance import CODED_MASS_ERROR
 from lod_cloud.codec.training import Sample, within
 from lod_cloud.lod_tree import Float32
@@ -117,7 +117,7 @@ class NodeFields:
         opacity, fits = self.opacity.encode(scene.opacities)
         dc, dc_fits = self.dc.encode(scene.sh[:, 0])
         spheres, wrapped = self.shape.encode_spheres(sigmas, nodes.radius, nodes.extent)
-        omitted, rotation = encode_rotation(quaternions.astype(np.float32), BYTE)
+        omitted, rotation = encode_rotation(quaternions.astype(np.float32), ROTATION)
         off = np.abs(self.position.decode(places, sigmas[:, 0]).astype(np.float64) - scene.means)
         mass = scene.opacities * surface(scales)
         lost = np.abs(self.opacity.decode(opacity) * surface(sigmas) - mass)
@@ -140,7 +140,7 @@ class NodeFields:
             decode_rotation(
                 values["rotation.axis"].astype(np.uint8),
                 _stacked(values, "rotation.0", "rotation.1", "rotation.2"),
-                BYTE,
+                ROTATION,
             ),
             sigmas.astype(np.float32),
             self.opacity.decode(values["opacity"].astype(np.uint16)),

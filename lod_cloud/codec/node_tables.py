@@ -7,11 +7,12 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from gaussians.codebook import Codebook
+from lod_cloud.codec.harmonic_rests import HarmonicRests
 from lod_cloud.codec.interface import References
 from lod_cloud.codec.node_columns import Coder, Column, Layout, Rows
 from lod_cloud.codec.node_fields import NodeFields
 from lod_cloud.codec.rans import Frequencies, Puller, Pusher
-from lod_cloud.codec.training import words_of
+from lod_cloud.codec.training import harmonics, words_of
 from lod_cloud.lod_tree import Int32, LodTree
 from lod_cloud.node_records import NodeRecords
 
@@ -22,7 +23,11 @@ _LEVELS_UP = (0, 1, 2, 4)  # from one to the next: parent, grandparent and so on
 
 def layout_of(fields: NodeFields, codebook: Codebook | None) -> Layout:
     """The columns of a codec with these fields and this codebook."""
-    return Layout.of(fields.dc.top + 1, [len(book) for book in codebook.stages] if codebook else [])
+    if codebook is None:
+        return Layout.of(fields.dc.top + 1, [], 0)
+    return Layout.of(
+        fields.dc.top + 1, [len(book) for book in codebook.stages], codebook.dimensions
+    )
 
 
 def pushing(pusher: Pusher, tables: Tables) -> Coder:
@@ -42,14 +47,18 @@ def pulling(puller: Puller, tables: Tables) -> Coder:
 
 
 def count_tables(
-    tree: LodTree, ids: Int32, fields: NodeFields, codebook: Codebook | None, tolerance: float
+    tree: LodTree,
+    ids: Int32,
+    fields: NodeFields,
+    codebook: Codebook | None,
+    rests: HarmonicRests | None,
+    tolerance: float,
 ) -> Tables:
     """Of nodes ``ids`` (ascending), each as a client gets it that holds its parent; how positions
     are told, also as one gets it that holds nothing near.
     """
     nodes = NodeRecords.of(tree, ids)
     codes, exact = fields.encode(nodes)
-    words, near = words_of(tree, ids, codebook)
     layout = layout_of(fields, codebook)
     kept, inner = ~exact, nodes.child_counts > 0
     where = codes.places[kept], codes.sigmas[kept, 0]
@@ -57,7 +66,7 @@ def count_tables(
         fields.position.choose(*where, held, tolerance)
         for held in _ancestors(tree, nodes.parents[kept])
     )
-    given = codes.columns(kept, inner, layout.colours) | layout.high_parts(words[near])
+    given = codes.columns(kept, inner, layout.colours)
     rows = [Rows.of(inner, nodes.parents, held) for held in (nodes.parents, None)]
     tables: dict[str, Frequencies] = {}
 
@@ -73,7 +82,14 @@ def count_tables(
         return values
 
     layout.fields(count, rows[0].take(kept), given | {"position": choices})
-    layout.harmonics(count, inner[near], given)
+    if codebook and rests:
+        words, near = words_of(tree, ids, codebook)
+        near &= inner
+        numbers = harmonics(tree.gaussians, ids[~near])
+        told = rests.told(codebook, words, near, numbers, inner)
+        found = {"harmonics.rest": told.rests.reshape(-1)}
+        found |= layout.high_parts(words[told.by_words])
+        layout.harmonics(count, inner[told.by_words], found)
     return tables
 
 

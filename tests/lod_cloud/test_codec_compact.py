@@ -286,6 +286,28 @@ def test_books_of_more_words_than_symbols() -> None:
     assert np.array_equal(decoded.gaussians.sh[near, 1:], right[near])
 
 
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_harmonics_of_leaves_are_good_to_half_a_step(degree: int) -> None:
+    """Others are what their words say; what is off by too much is exact, and an escape."""
+    tree = random_tree(300, 3, sh_degree=degree)
+    codec = CompactCodec.train(tree, 1, words=8)
+    assert codec.rests is not None and codec.codebook is not None
+    leaf = tree.child_count == 0
+    tree.gaussians.sh[np.flatnonzero(leaf)[:3], 1, 0] += 70 * np.float32(codec.rests.step)
+    tree.gaussians.sh[np.flatnonzero(~leaf)[:2], 1, 0] = 2.0
+    words, near = codec.assign_words(tree, np.arange(len(tree), dtype=np.int32))
+    decoded, _ = coded(tree, codec, np.arange(len(tree)))
+    off = np.abs(decoded.gaussians.sh[:, 1:] - tree.gaussians.sh[:, 1:]).max(axis=(1, 2))
+    assert 0.4 < off[leaf].max() / codec.rests.step < 0.5001
+    assert np.count_nonzero(off[leaf]) == np.count_nonzero(leaf) - 3
+    assert not near[leaf].any() and np.count_nonzero(~near[~leaf]) >= 2
+    assert not off[~near & ~leaf].any()
+    right = codec.codebook.decode(words).reshape(len(tree), -1, 3)
+    assert np.array_equal(decoded.gaussians.sh[near, 1:], right[near])
+    alone = TreeEncoder(tree, codec).encode_harmonics(np.arange(len(tree), dtype=np.int32))
+    assert alone.escapes == np.count_nonzero(~near & ~leaf) + 3
+
+
 def test_frequencies_of_a_session_start_are_checked() -> None:
     codec = CompactCodec.train(random_tree(60, 4), 1, words=8)
     data = codec.to_bytes()
@@ -297,13 +319,20 @@ def test_frequencies_of_a_session_start_are_checked() -> None:
         (b"[[1, 2], [3]]", "must be complete"),
     ):
         assert data.count(axis) == 1
-        size = int.from_bytes(data[:4], "little") + len(wrong) - len(axis)
         with pytest.raises(RemoteProtocolError, match=text):
-            read_codec(size.to_bytes(4, "little") + data[4:].replace(axis, wrong))
+            read_codec(_replaced(data, axis, wrong))
     with pytest.raises(RemoteProtocolError, match="must be complete"):
         read_codec(data.replace(b'"spheres.extent"', b'"spheres.extant"'))
+    with pytest.raises(RemoteProtocolError, match="step of harmonics must lie in"):
+        read_codec(_replaced(data, b'"harmonic_step": ', b'"harmonic_step": -'))
     with pytest.raises(InputError, match="colour bits must be 1 to 10"):
         CompactCodec.train(random_tree(60, 4), 1, words=8, colour_bits=11)
+
+
+def _replaced(data: bytes, text: bytes, other: bytes) -> bytes:
+    """Other parameters of a packed codec."""
+    size = int.from_bytes(data[:4], "little") + len(other) - len(text)
+    return size.to_bytes(4, "little") + data[4:].replace(text, other)
 
 
 @pytest.mark.parametrize("colour_bits", [8, 10])

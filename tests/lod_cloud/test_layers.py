@@ -37,8 +37,6 @@ def test_harmonics_apart_make_plain_nodes_complete(count: int, seed: int, far: b
         assert np.array_equal(getattr(plain.gaussians, name), getattr(right.gaussians, name))
     assert np.array_equal(plain.gaussians.sh[:, 0], right.gaussians.sh[:, 0])
     assert not plain.gaussians.sh[:, 1:].any() and "harmonics" not in bare.columns
-    _, near = codec.assign_words(tree, ids)
-    assert np.array_equal(right.gaussians.sh[~near, 1:], tree.gaussians.sh[~near, 1:])
     later = encoder.encode_harmonics(ids)
     assert sum(later.columns.values()) == len(later.payload)
     inner = tree.child_count > 0
@@ -83,7 +81,7 @@ def test_what_is_plain_is_not_merged() -> None:
 
 def completing() -> HostilePair:
     """A session whose client has its cut, some of it still plain; all is acknowledged."""
-    pair = HostilePair(world(400, 2, compact=True), budget=400)
+    pair = HostilePair(world(400, 2, compact=True), budget=150)
     pair.act(("walk", 1))
     pair._deliver_all()
     while pair.completed == 0:
