@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from gaussians import parallel
 from gaussians.codebook import AC_ERROR
+from gaussians.compression import ROTATION_ERROR_RAD
 from gaussians.errors import InputError
 from gaussians.scene import FIELDS
 from lod_cloud.build import BuildOptions, build_tree
@@ -71,6 +72,10 @@ def test_round_trip(count: int, seed: int, sh_degree: int) -> None:
     )
     assert (np.abs(masses(decoded) - masses(original)) <= 0.0901 * masses(original)).all()
     assert np.abs(new.sh[:, 1:] - old.sh[:, 1:]).max(initial=0) <= AC_ERROR
+    exact = (new.quaternions == old.quaternions).all(axis=1)  # with the axes in their own order
+    cosines = np.abs((sorted_axes(old.scales, old.quaternions)[1] * new.quaternions).sum(axis=1))
+    turned = 2 * np.arccos(np.minimum(cosines[~exact], 1))
+    assert (turned <= ROTATION_ERROR_RAD * 65535 / 127).all()
     off = np.abs(new.sh[:, 0].astype(float) - old.sh[:, 0])
     assert off.max(initial=0) <= codec.fields.dc.max_error
     assert (decoded.radius >= original.radius).all()
