@@ -7,7 +7,7 @@ Field, coding, largest error:
   deviation
 * scales: the largest of the three as a logarithm over the tree's range, the others as 8-bit
   logarithms of their ratio to it, 2^-12 to 1 (what is smaller is coded as 0); `LogField.max_ratio`
-* rotation: smallest three, 3 x 7 bit and a 2-bit index, of the axes ordered by scale; 0.04 rad
+* rotation: smallest three, 3 x 6 bit and a 2-bit index, of the axes ordered by scale; 0.09 rad
 * opacity: logarithm over the tree's range, 0 exactly
 * SH degree 0: `colour_bits` each, linear over the tree's range
 * SH above: words of a residual codebook; 1 per coefficient. Of leaves also what these leave over,

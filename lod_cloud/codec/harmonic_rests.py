@@ -24,7 +24,7 @@ Mask = NDArray[np.bool_]
 RESTS = 127  # codes of a coefficient: 63 steps either way
 _MOST = (RESTS - 1) // 2
 _MOST_STEP = 1e30
-_STEP = 1.5  # in root mean squares of what words leave over
+_STEP = 1.6  # in root mean squares of what words leave over
 
 
 @dataclass(frozen=True)

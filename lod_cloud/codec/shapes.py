@@ -15,7 +15,7 @@ Float64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 BYTE = 255
-ROTATION = 127
+ROTATION = 63
 WIDE = 351  # for ranges that take in the coarsest nodes: codes that are rare cost the others little
 SPHERE = 15
 _THINNEST = -12.0  # logarithm of a ratio that is told from 0
