@@ -227,12 +227,11 @@ class Report:
 
     def growth(self, first: Subject, last: Subject, intervals: Sequence[int]) -> None:
         """How the wheel grows from a tree to a larger one that contains it, at the same views: at
-        the tau of the report, and at the one it is judged at.
+        the tau of the report, and at one whose detail ends nearer.
         """
         inside = replace(first, view=first.middle)  # as far from its edge as can be
         name = f"{WALK} in the middle of {first.name}"
         rows = []
-        street = False
         for tau_px in sorted({self._tau_px, lod_targets.GROWTH_TAU_PX}):
             for every in intervals:
                 requests = inside.requests(WALK, every, tau_px, self._searches)
@@ -241,8 +240,7 @@ class Report:
                     for subject in (first, last)
                 )
                 row = {"tau_px": tau_px, "every": every} | _growth(small, large)
-                street = street or lod_targets.is_street(small, every)
-                place = Place(first.name, len(first.tree), street)
+                place = Place(first.name, len(first.tree), lod_targets.is_street(small, every))
                 self.verdicts += lod_targets.growth_verdicts(place, last.name, row)
                 rows.append(row)
         self.lines += [f"### Wheel, from {first.name} to {last.name}, {name}", ""]
