@@ -15,8 +15,8 @@ STREET_ADDS_PER_M = 30_000
 METRES_PER_FRAME = 1.4 / 90  # walking
 FLAT_NS_PER_NODE = 3.5  # slower than this the baseline would flatter everything else
 GROWTH = 1.3
-# At 6 px the smaller cities end before detail does; at this tau most of what changes lies inside
-# the sparse one, as it did when the target was set. Both are judged.
+# At 6 px the smaller sparse city ends before detail does; at this tau most of what changes lies
+# inside it. Both are judged.
 GROWTH_TAU_PX = 15.0
 WORST_OF_STREAMING = 1.5
 FULL_SIZE = 20_000_000  # leaves of the trees the rates are meant for

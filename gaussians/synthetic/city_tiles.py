@@ -3,8 +3,10 @@
 Towns of 160 m x 160 m (`layout`) stand side by side, each with houses of its own and with the same
 number of splats; their main streets join. A city is the splats of this endless plane that stand
 nearest to the origin, in squares around it: a larger city contains the smaller ones of the same
-density and seed, splat for splat, so that a view can be held fixed while the scene grows. Unlike
-`city.generate_city`, density does not depend on where a walker goes: this is what level-of-detail
+density and seed, splat for splat, so that a view can be held fixed while the scene grows. In both
+densities a surface has the more splats the more of it shows; in ``dense`` they also stand farther
+apart the farther it is from a main street, as in scans, whose cameras are carried along streets.
+Unlike in `city.generate_city` no part of a street is preferred. This is what level-of-detail
 searches are measured on.
 """
 
@@ -59,11 +61,16 @@ class CityDensity:
     base: float  # spread of the covering splats relative to the distance between them
     detail: float  # least spread of the others, relative to that distance
     tail: float  # exponent of their sizes: spread = least / u ** tail, u uniform in 0..1
+    even_m: float  # from the middle of a main street at eye level; beyond, density falls as 1 / m^2
 
 
 DENSITIES = {
-    "city": CityDensity(leaves_per_m2=5.0, cell_m=16.0, base=0.55, detail=0.30, tail=0.30),
-    "dense": CityDensity(leaves_per_m2=212.0, cell_m=2.5, base=0.50, detail=0.29, tail=0.60),
+    "city": CityDensity(
+        leaves_per_m2=5.0, cell_m=16.0, base=0.55, detail=0.30, tail=0.30, even_m=math.inf
+    ),
+    "dense": CityDensity(
+        leaves_per_m2=160.0, cell_m=2.5, base=0.50, detail=0.29, tail=0.60, even_m=3.0
+    ),
 }
 
 
@@ -162,8 +169,8 @@ class _Cells:
     patch: Ids  # [C] rectangle, or -1 - crown
     corners: Float64  # [C, 2] metres on the rectangle
     sizes: Float64  # [C, 2]
-    areas: Float64  # [C] square metres to cover
-    weights: Float64  # [C]
+    expected: Float64  # [C] splats
+    apart: Float64  # [C] metres between neighbouring splats
     off_centre: Float64  # [C] metres from the origin along x or y, whichever is more
 
     def take(self, rows: Ids) -> _Cells:
@@ -182,10 +189,9 @@ class _Town:
     def of(cls, city: TiledCity, place: Place) -> _Town:
         rng = _generator(city.seed, place, 0)
         geometry = _moved(open_town(rng), place)
-        density = DENSITIES[city.density]
-        cells = _cells(geometry, density.cell_m)
-        total = round(density.leaves_per_m2 * TOWN_M * TOWN_M)
-        return cls(geometry, cells, systematic_counts(cells.weights, total, float(rng.random())))
+        cells = _cells(geometry, DENSITIES[city.density], place[1] * TOWN_M)
+        total = round(DENSITIES[city.density].leaves_per_m2 * TOWN_M * TOWN_M)
+        return cls(geometry, cells, systematic_counts(cells.expected, total, float(rng.random())))
 
 
 def _town_tiles(city: TiledCity, place: Place, taken: Ids) -> Iterator[Scene]:
@@ -235,26 +241,30 @@ def _moved(geometry: Geometry, town: Place) -> Geometry:
     return Geometry(patches, replace(geometry.crowns, centres=geometry.crowns.centres + shift))
 
 
-def _cells(geometry: Geometry, most_m: float) -> _Cells:
+def _cells(geometry: Geometry, density: CityDensity, street_y: float) -> _Cells:
     """Rectangles cut evenly into cells, and crowns; neighbours on the ground follow each other."""
     patches, crowns = geometry.patches, geometry.crowns
-    pieces = np.maximum(np.ceil(patches.lengths / most_m).astype(np.int64), 1)
+    pieces = np.maximum(np.ceil(patches.lengths / density.cell_m).astype(np.int64), 1)
     number = pieces.prod(axis=1)
     patch = np.repeat(np.arange(len(patches)), number)
     index = np.arange(len(patch)) - np.repeat(np.cumsum(number) - number, number)
     sizes = (patches.lengths / pieces)[patch]
     corners = np.stack([index % pieces[patch, 0], index // pieces[patch, 0]], axis=1) * sizes
-    area = sizes[:, 0] * sizes[:, 1]
+    area = np.concatenate([sizes[:, 0] * sizes[:, 1], leaf_area(crowns)])
     value = patches.exposures * RICHNESS[patches.materials]
     centres = np.concatenate([on_patches(patches, patch, corners + 0.5 * sizes), crowns.centres])
+    aside, up = centres[:, 1] - street_y, centres[:, 2] - EYE_HEIGHT_M
+    nearness = np.minimum(1.0, density.even_m / np.sqrt(aside * aside + up * up))
+    wanted = np.concatenate([value[patch], crowns.exposures]) * nearness * nearness
+    scale = density.leaves_per_m2 * TOWN_M * TOWN_M / np.cumsum(area * wanted)[-1]
+    whole = np.concatenate([patches.lengths.prod(axis=1)[patch], leaf_area(crowns)])
     nothing = np.zeros((len(crowns), 2))
-    leafy = leaf_area(crowns)
     cells = _Cells(
         np.concatenate([patch, -1 - np.arange(len(crowns))]),
         np.concatenate([corners, nothing]),
         np.concatenate([sizes, nothing]),
-        np.concatenate([area, leafy]),
-        np.concatenate([area * value[patch], leafy * crowns.exposures]),
+        area * wanted * scale,
+        np.minimum(1.0 / np.sqrt(wanted * scale), np.sqrt(whole)),  # not beyond a small thing
         np.abs(centres[:, :2]).max(axis=1),
     )
     keys = [np.floor(centres[:, axis] / edge) for edge in (_SORT_M, _BLOCK_M) for axis in (1, 0)]
@@ -272,7 +282,7 @@ def _sample(
     which of all splats, cell by cell, stand in which place of the chunks.
     """
     cell = np.repeat(np.arange(len(counts)), counts)
-    apart = np.sqrt(cells.areas / np.maximum(counts, 1))[cell]
+    apart = cells.apart[cell]
     covering = rng.random(len(cell)) < OPAQUE_SHARE
     tail = 1.0 / np.maximum(rng.random(len(cell)), 1e-9)
     detail = density.detail * np.minimum(_power(tail, density.tail), _COARSEST)

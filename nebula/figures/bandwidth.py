@@ -42,6 +42,7 @@ from nebula.figures.trees import (
 from nebula.figures.video import PRESET, QUALITIES, UInt8, require_av, transcode
 from nebula.options import FigureOptions
 from nebula.progress import progress
+from nebula.scene_input import require_visible
 from nebula.session_config import load_session_config
 
 FRAMES = 17
@@ -175,6 +176,8 @@ class Views:
         """Both eyes of a scene in a frame."""
         rig = self.subject.rig(self.trace, frame, self._display, self._baseline_m)
         drawn = render_stereo(scene, rig, PRESETS["exact"])
+        if frame == 0:  # later ones may look away
+            require_visible(sum(drawn.visible), "bandwidth")
         return to_8bit(drawn.left), to_8bit(drawn.right)
 
     def _all_leaves(self) -> dict[int, tuple[UInt8, UInt8]]:

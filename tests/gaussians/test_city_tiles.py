@@ -62,6 +62,17 @@ def test_tiles_are_small_and_stand_together(monkeypatch: pytest.MonkeyPatch) -> 
     assert np.median([box.min() for box in boxes]) < city.half_m
 
 
+@pytest.mark.parametrize(("density", "thinner"), [("city", 1.0), ("dense", (32 / 12) ** 2)])
+def test_scans_thin_out_away_from_the_street(density: str, thinner: float) -> None:
+    """On the carriageway of a side street, which shows alike all along."""
+    counts = np.zeros(2)
+    for tile in TiledCity(2_000_000, density, sh_degree=0).tiles():
+        x, y, z = tile.means.T
+        road = (x > 11) & (x < 17) & (np.abs(z) < 0.1)
+        counts += [(road & (np.abs(y) > low) & (np.abs(y) < low + 4)).sum() for low in (10, 30)]
+    assert counts[0] / counts[1] == pytest.approx(thinner, rel=0.15)
+
+
 def test_towns_differ_and_join() -> None:
     city = TiledCity(400_000, "city", sh_degree=0)
     assert city.half_m == pytest.approx(141.4, rel=0.1)  # a town and parts of eight others

@@ -25,12 +25,12 @@ def tree_of(city: TiledCity) -> LodTree:
     [
         (
             "dense",
-            600_000,  # a piece of street without its houses: at full size there is 2.5 times more
+            600_000,  # some metres of street: at full size three times as much changes
             {
-                "leaves_per_m2": (520, 640),
-                "sigma_m": (0.030, 0.040),
-                "large_leaf_share": (0.33, 0.40),
-                "added_per_m": (7_000, 14_000),
+                "leaves_per_m2": (1200, 1550),
+                "sigma_m": (0.021, 0.029),
+                "large_leaf_share": (0.35, 0.43),
+                "added_per_m": (18_000, 29_000),
             },
         ),
         (

@@ -17,8 +17,8 @@ DISPLAY = {"width": 96, "height": 64, "fov_deg": 90.0}
 
 
 def small_street(place: Path) -> Path:
-    """A few metres of dense street, harmonics of degree 1, written to ``place``."""
-    city = TiledCity(4000, "dense", 3, 1)
+    """Some metres of street, harmonics of degree 1, written to ``place``."""
+    city = TiledCity(4000, "city", 3, 1)
     tiles = list(city.tiles())
     scene = Scene(*(np.concatenate([getattr(t, f) for t in tiles]) for f in FIELDS))
     path = tuple((float(x), float(y), float(z)) for x, y, z in city.path)

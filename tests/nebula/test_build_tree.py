@@ -21,12 +21,12 @@ def run(*arguments: str) -> int:
 
 def test_a_tiled_city_is_built_and_described(tmp_path: Path, capsys) -> None:
     out, report = tmp_path / "tree", tmp_path / "build.json"
-    size = ("--city-leaves", "20000", "--sh-degree", "1", "--fan-out-ratio", "0.7", "--seed", "5")
+    size = ("--city-leaves", "100000", "--sh-degree", "1", "--fan-out-ratio", "0.7", "--seed", "5")
     line = ("build-tree", "--tiled", "dense_city", *size, "--out", str(out), "--json", str(report))
     assert run(*line) == 0
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
     data = json.loads(report.read_text())
-    assert (data["leaves"], data["sh_degree"], data["nesting_violations"]) == (20_000, 1, 0)
+    assert (data["leaves"], data["sh_degree"], data["nesting_violations"]) == (100_000, 1, 0)
     assert data["build"]["fan_out_ratio"] == 0.7 and data["build"]["pair_within"] == 16
     for name in ("generate_s", "spool_s", "build_s", "proof_s", "disk_s", "peak_rss_bytes"):
         assert data[name] > 0

@@ -188,6 +188,12 @@ def test_a_scene_too_large_to_render_whole_is_said_not_to_be_compared(asked, mon
 
 
 @needs_av
+def test_a_view_of_nothing_is_refused(asked):
+    with pytest.raises(InputError, match="bandwidth: no splat is visible from this view"):
+        figure.run(asked(given={"trace": "stand", "view": "1e4,0,0:2e4,0,0"}))
+
+
+@needs_av
 def test_too_few_frames_for_a_search_are_refused(asked):
     with pytest.raises(InputError, match="--frames must be above the 4 of a search, not 4"):
         figure.run(asked(frames=4))
