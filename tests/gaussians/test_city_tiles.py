@@ -73,6 +73,21 @@ def test_scans_thin_out_away_from_the_street(density: str, thinner: float) -> No
     assert counts[0] / counts[1] == pytest.approx(thinner, rel=0.15)
 
 
+def test_every_town_is_scanned_from_its_own_street() -> None:
+    city = TiledCity(1000, "dense")
+    shares = []
+    for place in ((0, 0), (-2, 3)):
+        town = city_tiles._Town.of(city, place)
+        cells, patches = town.cells, town.geometry.patches
+        flat = cells.patch >= 0
+        aside = np.abs(patches.origins[cells.patch[flat], 1] - place[1] * city_tiles.TOWN_M)
+        shares.append(town.counts[flat][aside < 8.0].sum() / town.counts.sum())
+        # where few splats are expected they still are no larger than what they stand for
+        edges = np.sqrt(patches.lengths[cells.patch[flat]].prod(axis=1))
+        assert (cells.apart[flat] <= edges * (1 + 1e-12)).all()
+    assert shares[0] > 0.5 and shares[1] == pytest.approx(shares[0], rel=0.1)
+
+
 def test_towns_differ_and_join() -> None:
     city = TiledCity(400_000, "city", sh_degree=0)
     assert city.half_m == pytest.approx(141.4, rel=0.1)  # a town and parts of eight others
