@@ -78,7 +78,7 @@ class WheelSearch(Search):
         return outcome
 
     def _clear(self) -> None:
-        self._hands[:] = 0.0
+        self._hands[:] = wheel.START_M
         self._heads[:] = -1
         self._counts[:] = -1, 0, 0
         self._scheduled[:] = 0

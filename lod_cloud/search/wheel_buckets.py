@@ -40,6 +40,8 @@ KAPPA, MU = 0.1, 0.05
 HANDS = 2 * SECTORS + 1  # hand 2 j + kind belongs to sector j; the last one moves with the path
 FINE_M, FINE = 2.0**-7, 8  # width and number of fine buckets of a hand: one coarse bucket
 COARSE_M, COARSE = 2.0**-4, 512
+# Hands start apart: where many advance alike they enter coarse buckets one by one, not all at once.
+START_M = COARSE_M * np.modf(np.arange(HANDS) * 0.6180339887498949)[0]
 FINE_BITS = 3  # FINE = 2^3
 COARSE_BEGIN = HANDS * FINE  # fine buckets stand together: they fit into the nearest cache
 BUCKETS = HANDS * (FINE + COARSE) + 1  # the last one is popped at every search

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lod_cloud.criterion import SearchRequest
-from lod_cloud.search import make_search
+from lod_cloud.search import make_search, wheel_buckets
 from lod_cloud.search.sectors import SECTORS, SIDE, _unbent, sector_of, sector_table
 from tests.lod_cloud.search_trees import TREES
 
@@ -59,3 +59,15 @@ def test_hands_that_run_backwards(step: float) -> None:
             assert np.array_equal(flat.collapsed, wheel.collapsed)
             changes += len(flat.expanded) + len(flat.collapsed)
     assert changes > 10
+
+
+def test_hands_enter_coarse_buckets_one_by_one() -> None:
+    """A search that popped the coarse buckets of many hands would take several times as long."""
+    hands, rates = wheel_buckets.START_M.copy(), np.empty(wheel_buckets.HANDS)
+    spans = np.empty((wheel_buckets.HANDS, 4), np.int32)
+    step = np.array([0.062, 0.0, 0.0])  # walking, a search every four frames
+    entered = []
+    for _ in range(200):
+        wheel_buckets._advance(step, hands, rates, *sector_table(), spans)
+        entered.append(int(spans[:, 3].sum()))
+    assert 50 < max(entered) < 1.3 * np.mean(entered)
