@@ -3,7 +3,7 @@
     python -m benchmarks.stream rate --tree DIR --trace walk --every 4 --hysteresis 0
     python -m benchmarks.stream loss --scene FILE --up=-y --units-per-metre 1 --tau 6
     python -m benchmarks.stream loss --city 200000
-    python -m benchmarks.stream loss --tree DIR --codec compact-2048x1
+    python -m benchmarks.stream loss --tree DIR --codec compact-512x2
 
 ``rate`` follows a trace through a tree, which may be mapped, after the first cut is there: Mbps at
 90 Hz, bytes by kind of field, escapes, share merged by the client, message sizes, coding time. The

@@ -96,8 +96,8 @@ class CompactCodec:
         tree: LodTree,
         seed: int,
         *,
-        words: int = 2048,
-        stages: int = 1,
+        words: int = 512,
+        stages: int = 2,
         position_bits: int = 6,
         colour_bits: int = 7,
     ) -> CompactCodec:
