@@ -153,19 +153,18 @@ def _codec(name: str, tree: LodTree, options: argparse.Namespace) -> Codec:
 
 def _poses(arguments: argparse.Namespace) -> tuple[LodTree, list[Pose]]:
     """The scene's tree, and where to look from."""
+    path: Any = []
     if arguments.city:
         city = generate_city(arguments.city, 0, sh_degree=3)
-        tree = build_tree(city.scene, up=(0.0, 0.0, 1.0))
-        views = _along([np.array(point) for point in city.path])
+        tree, path = build_tree(city.scene, up=(0.0, 0.0, 1.0)), city.path
     elif arguments.tree:
         tree = load_tree(arguments.tree)
-        views = _along([np.array(point) for point in tree.metadata.path])
+        path = tree.metadata.path
     else:
         scene, _ = load_scene(arguments.scene, arguments.level)
         tree = build_tree(scene.scaled(1 / arguments.units_per_metre))
-        views = [
-            (np.array(eye), np.array(target)) for eye, target in map(parse_view, arguments.view)
-        ]
+    given = [(np.array(eye), np.array(target)) for eye, target in map(parse_view, arguments.view)]
+    views = given or _along([np.array(point) for point in path])
     up = {"+z": (0.0, 0.0, 1.0), "-y": (0.0, -1.0, 0.0)}[arguments.up]
     return tree, [look_at(eye, target, np.array(up)) for eye, target in views]
 
@@ -200,6 +199,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--fields", action="store_true", help="each field alone, too")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
+    if options.scene and not options.view:
+        parser.error("--scene needs at least one --view")
     parallel.set_threads(1)
     print(in_words(describe()))
     names = options.codec or ["paper", "compact-256x1", "compact-2048x1", "compact-512x2"]
