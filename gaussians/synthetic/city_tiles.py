@@ -189,8 +189,9 @@ class _Town:
     def of(cls, city: TiledCity, place: Place) -> _Town:
         rng = _generator(city.seed, place, 0)
         geometry = _moved(open_town(rng), place)
-        cells = _cells(geometry, DENSITIES[city.density], place[1] * TOWN_M)
-        total = round(DENSITIES[city.density].leaves_per_m2 * TOWN_M * TOWN_M)
+        density = DENSITIES[city.density]
+        cells = _cells(geometry, density, place[1] * TOWN_M)
+        total = round(density.leaves_per_m2 * TOWN_M * TOWN_M)
         return cls(geometry, cells, systematic_counts(cells.expected, total, float(rng.random())))
 
 
@@ -250,14 +251,15 @@ def _cells(geometry: Geometry, density: CityDensity, street_y: float) -> _Cells:
     index = np.arange(len(patch)) - np.repeat(np.cumsum(number) - number, number)
     sizes = (patches.lengths / pieces)[patch]
     corners = np.stack([index % pieces[patch, 0], index // pieces[patch, 0]], axis=1) * sizes
-    area = np.concatenate([sizes[:, 0] * sizes[:, 1], leaf_area(crowns)])
+    leafy = leaf_area(crowns)
+    area = np.concatenate([sizes[:, 0] * sizes[:, 1], leafy])
+    whole = np.concatenate([patches.lengths.prod(axis=1)[patch], leafy])
     value = patches.exposures * RICHNESS[patches.materials]
     centres = np.concatenate([on_patches(patches, patch, corners + 0.5 * sizes), crowns.centres])
     aside, up = centres[:, 1] - street_y, centres[:, 2] - EYE_HEIGHT_M
     nearness = np.minimum(1.0, density.even_m / np.sqrt(aside * aside + up * up))
     wanted = np.concatenate([value[patch], crowns.exposures]) * nearness * nearness
     scale = density.leaves_per_m2 * TOWN_M * TOWN_M / np.cumsum(area * wanted)[-1]
-    whole = np.concatenate([patches.lengths.prod(axis=1)[patch], leaf_area(crowns)])
     nothing = np.zeros((len(crowns), 2))
     cells = _Cells(
         np.concatenate([patch, -1 - np.arange(len(crowns))]),
